@@ -1,0 +1,1 @@
+"""RGB-D sequences: recognised, read, undistorted, and checked; one file per layout."""

@@ -1,0 +1,34 @@
+"""One RGB-D image pair with its time: all that the online system ever sees of the world.
+
+No pose and no ground truth ride here; those belong to `datasets.Sequence` and are read by `evaluation` only.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from tcgsplat.geometry.camera import Camera
+from tcgsplat.tensors import Image, Mask, Plane
+
+
+@dataclass(frozen=True)
+class Frame:
+    """An undistorted colour image and the depth image registered to it."""
+
+    index: int
+    """Place in the sequence, from 0; dropped and broken frames leave gaps."""
+    timestamp: float
+    """Seconds, of the colour image."""
+    color: Image
+    """RGB in [0, 1], float32."""
+    depth: Plane
+    """Metres along the optical axis, float32; 0 where there is no reading."""
+    valid: Mask
+    """Pixels that saw the world: false on the border that undistortion leaves empty."""
+    camera: Camera
+
+    def to(self, device: torch.device) -> "Frame":
+        """The same frame on another device; itself if it is there already."""
+        if self.color.device == device:
+            return self
+        return replace(self, color=self.color.to(device), depth=self.depth.to(device), valid=self.valid.to(device))

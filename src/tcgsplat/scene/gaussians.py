@@ -1,0 +1,141 @@
+"""3D Gaussians: raw parameters, their activations (Eq. 1) and covariance (Eq. 2).
+
+Every per-Gaussian tensor here and in `ConfidenceState` is a row table; rows are only ever appended and kept together,
+through `Submap.grown` and `Submap.kept`.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tcgsplat.geometry import quaternion
+from tcgsplat.tensors import Ids, PerGaussian, PerGaussianFlag
+
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+MAX_SH_DEGREE = 3
+
+
+def sh_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n k"]:
+    """Real spherical harmonics up to `degree` (0 to 3) at unit directions; k = (degree + 1)^2.
+
+    Signs and order are those that 3D Gaussian splatting files use (Kerbl et al. 2023), so that maps open elsewhere.
+    """
+    x, y, z = directions.unbind(-1)
+    basis = [torch.full_like(x, SH_C0)]
+    if degree >= 1:
+        c = 0.4886025119029199
+        basis += [-c * y, c * z, -c * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        basis += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ]
+    if degree >= 3:
+        basis += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    return torch.stack(basis, dim=-1)
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """A set of anisotropic Gaussians in the frame of their submap (Eq. 1), as raw, optimisable parameters."""
+
+    ids: Ids
+    """Unique in the run; a Gaussian keeps its id through growing and pruning."""
+    means: Float[Tensor, "n 3"]
+    """Centres in the map frame, metres."""
+    log_scales: Float[Tensor, "n 3"]
+    """Natural logarithm of the standard deviations along the own axes, metres."""
+    quats: Float[Tensor, "n 4"]
+    """Own axes to map frame, wxyz, any non-zero length."""
+    logit_opacities: Float[Tensor, " n"]
+    sh: Float[Tensor, "n k 3"]
+    """Spherical harmonics of colour; k = (degree + 1)^2."""
+
+    def __len__(self) -> int:
+        return int(self.ids.shape[0])
+
+    @staticmethod
+    def empty(sh_degree: int = 0, device: torch.device | None = None) -> "Gaussians":
+        """No Gaussians yet."""
+        k = (sh_degree + 1) ** 2
+        return Gaussians(
+            ids=torch.zeros(0, dtype=torch.int64, device=device),
+            means=torch.zeros(0, 3, device=device),
+            log_scales=torch.zeros(0, 3, device=device),
+            quats=torch.zeros(0, 4, device=device),
+            logit_opacities=torch.zeros(0, device=device),
+            sh=torch.zeros(0, k, 3, device=device),
+        )
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    @property
+    def scales(self) -> Float[Tensor, "n 3"]:
+        """Standard deviations along the own axes, metres (s of Eq. 1)."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> PerGaussian:
+        """Peak alpha in (0, 1) (o of Eq. 1)."""
+        return self.logit_opacities.sigmoid()
+
+    def colors(self, viewpoint: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
+        """RGB seen from a camera centre in the map frame: max(0, SH(direction) + 0.5)."""
+        if self.sh_degree == 0:  # the direction does not matter, and neither should it cost time
+            return (SH_C0 * self.sh[:, 0] + 0.5).clamp_min(0.0)
+        directions = torch.nn.functional.normalize(self.means - viewpoint, dim=-1)
+        basis = sh_basis(directions, self.sh_degree)
+        return (torch.einsum("nk,nkc->nc", basis, self.sh) + 0.5).clamp_min(0.0)
+
+    def covariances(self) -> Float[Tensor, "n 3 3"]:
+        """Sigma = R(q) diag(s^2) R(q)^T in the map frame, square metres (Eq. 2)."""
+        M = quaternion.to_matrix(self.quats) * self.scales[:, None, :]
+        return M @ M.transpose(-1, -2)
+
+    def appended(self, other: "Gaussians") -> "Gaussians":
+        """These Gaussians, then the other ones."""
+        return Gaussians(**{f.name: torch.cat((getattr(self, f.name), getattr(other, f.name))) for f in fields(self)})
+
+    def kept(self, keep: PerGaussianFlag) -> "Gaussians":
+        """Only the flagged rows, in their order."""
+        return Gaussians(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+    def to(self, device: torch.device) -> "Gaussians":
+        """The same Gaussians on another device."""
+        return Gaussians(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+    def transformed(self, T_b_a: Float[Tensor, "4 4"]) -> "Gaussians":
+        """The same Gaussians in frame b, given here in frame a. Degree 0 colour only: higher degrees turn with it.
+
+        Raises:
+            ValueError: if the colour has a degree above 0.
+        """
+        if self.sh_degree > 0:
+            raise ValueError(
+                "Gaussians with view-dependent colour cannot be rotated: their harmonics would have to turn"
+            )
+        T = T_b_a.to(self.means)
+        q = quaternion.from_matrix(T[:3, :3])
+        return replace(
+            self,
+            means=self.means @ T[:3, :3].T + T[:3, 3],
+            quats=quaternion.multiply(q.expand_as(self.quats), self.quats),
+        )

@@ -1,0 +1,67 @@
+"""A local Gaussian map in a frame of its own: the only thing that changes hands between the stages.
+
+Loop closure moves one pose, `T_world_map`; everything inside stays in the map frame, so nothing in it is rewritten.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from tcgsplat.confidence.state import ConfidenceConfig, ConfidenceState
+from tcgsplat.geometry import se3
+from tcgsplat.scene.frame import Frame
+from tcgsplat.scene.gaussians import Gaussians
+from tcgsplat.tensors import PerGaussianFlag, Pose
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A frame kept for mapping, with its pose in the submap."""
+
+    frame: Frame
+    T_map_cam: Pose
+
+
+@dataclass(frozen=True)
+class Submap:
+    """Gaussians, their confidence and the keyframes that they were optimised on."""
+
+    index: int
+    """Place among the submaps of the run, from 0."""
+    T_world_map: Pose
+    """Where the map frame stands in the world: the pose of the first camera of the submap."""
+    gaussians: Gaussians
+    confidence: ConfidenceState
+    keyframes: tuple[Keyframe, ...] = ()
+    clock: int = 0
+    """Mapping updates so far: the paper's t, the time that confidence lives in."""
+
+    @staticmethod
+    def anchored(T_world_map: Pose, index: int, sh_degree: int = 0, device: torch.device | None = None) -> "Submap":
+        """An empty submap whose frame is the camera at `T_world_map`."""
+        return Submap(
+            index=index,
+            T_world_map=se3.orthonormalized(T_world_map),
+            gaussians=Gaussians.empty(sh_degree, device),
+            confidence=ConfidenceState.empty(device),
+        )
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    def grown(self, new: Gaussians, config: ConfidenceConfig) -> "Submap":
+        """With new Gaussians appended; their confidence is born at this submap's clock."""
+        born = ConfidenceState.born_at(self.clock, len(new), config, device=new.means.device)
+        return replace(self, gaussians=self.gaussians.appended(new), confidence=self.confidence.appended(born))
+
+    def kept(self, keep: PerGaussianFlag) -> "Submap":
+        """With only the flagged Gaussians and their confidence."""
+        return replace(self, gaussians=self.gaussians.kept(keep), confidence=self.confidence.kept(keep))
+
+    def with_keyframe(self, keyframe: Keyframe) -> "Submap":
+        """With one more keyframe."""
+        return replace(self, keyframes=(*self.keyframes, keyframe))
+
+    def sealed(self, config: ConfidenceConfig) -> "Submap":
+        """The finished submap: confidence calibrated for unequal ages (Eq. 16). Seal once, and keep unchanged."""
+        return replace(self, confidence=self.confidence.sealed(config))

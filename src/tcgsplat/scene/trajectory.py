@@ -1,0 +1,80 @@
+"""The camera's path, kept relative to submaps, so that moving a submap moves every frame that was tracked in it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from tcgsplat.geometry import quaternion
+from tcgsplat.scene.atlas import Atlas
+from tcgsplat.tensors import Pose
+
+
+@dataclass(frozen=True)
+class TrackedPose:
+    """One frame's pose in the submap that was active when it was tracked."""
+
+    frame_index: int
+    timestamp: float
+    """Seconds."""
+    submap_index: int
+    T_map_cam: Pose
+    lost: bool = False
+    """The pose is a prediction: tracking did not converge."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses in the order of the frames."""
+
+    rows: tuple[TrackedPose, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def with_row(self, row: TrackedPose) -> "Trajectory":
+        """With one more frame."""
+        return Trajectory((*self.rows, row))
+
+    def world(self, atlas: Atlas) -> list[Pose]:
+        """`T_world_cam` of every row; composed late, so that corrections of the atlas reach every frame."""
+        return [atlas.T_world_map[row.submap_index] @ row.T_map_cam for row in self.rows]
+
+
+def format_tum(
+    timestamps: "list[float] | np.ndarray[tuple[int], np.dtype[np.float64]]", T_world_cam: list[Pose]
+) -> str:
+    """Trajectory as text in the TUM format: `timestamp tx ty tz qx qy qz qw`, metres, camera to world.
+
+    Seventeen digits, so that reading it back gives the same numbers.
+    """
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    for stamp, T in zip(timestamps, T_world_cam, strict=True):
+        w, x, y, z = quaternion.from_matrix(T[:3, :3]).tolist()
+        tx, ty, tz = T[:3, 3].tolist()
+        lines.append(f"{stamp:.6f} " + " ".join(f"{value:.17g}" for value in (tx, ty, tz, x, y, z, w)))
+    return "\n".join(lines) + "\n"
+
+
+def parse_tum(text: str) -> tuple[list[float], list[Pose]]:
+    """Time stamps (s) and `T_world_cam` from text in the TUM format; lines that begin with `#` are skipped.
+
+    Raises:
+        ValueError: if a line has not eight numbers; the message gives its number.
+    """
+    stamps: list[float] = []
+    poses: list[Pose] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.replace(",", " ").split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            stamp, tx, ty, tz, qx, qy, qz, qw = (float(word) for word in words[:8])
+        except ValueError as error:
+            raise ValueError(f"line {number} is not 'timestamp tx ty tz qx qy qz qw': {line.strip()!r}") from error
+        T = torch.eye(4, dtype=torch.float64)
+        T[:3, :3] = quaternion.to_matrix(torch.tensor([qw, qx, qy, qz], dtype=torch.float64))
+        T[:3, 3] = torch.tensor([tx, ty, tz], dtype=torch.float64)
+        stamps.append(stamp)
+        poses.append(T)
+    return stamps, poses
