@@ -1,0 +1,185 @@
+"""What a run leaves on disk, written as the run goes, so that a killed run loses no sealed submap.
+
+    RUN/
+      run.json           what this folder is: {"kind": "run", "version": 1, "sequence": path of the data}
+      config.toml        the resolved settings
+      submaps/0000.npz   one sealed submap each, with its keyframes (see `archive`)
+      trajectory.npz     exact: pose of every frame in its submap, and pose of every submap in the world
+      trajectory.txt     the same composed: camera to world, TUM format
+      summary.json       at the end only: frames, seconds, peak_rss_mb, stage_ms, ...
+      report.json, contact_sheet.png, trajectory.png    written by the evaluation
+
+Every file is complete or absent. A submap's file is written before the trajectory that speaks of it, and never again:
+loop closure moves submaps by `trajectory.npz` alone.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tcgsplat.errors import ArchiveError
+from tcgsplat.scene.atlas import Atlas
+from tcgsplat.scene.submap import Submap
+from tcgsplat.scene.trajectory import TrackedPose, Trajectory, format_tum
+from tcgsplat.storage import archive, atomic
+from tcgsplat.tensors import Pose
+
+
+@dataclass(frozen=True)
+class RunDirectory:
+    """The folder of one run: written by `slam` as it goes, read by resume, `eval`, `export` and `view`."""
+
+    path: Path
+
+    @staticmethod
+    def create(path: Path, *, config_toml: str, sequence: str) -> "RunDirectory":
+        """Begin a run in a new or empty folder.
+
+        Args:
+            path: The folder; its parents are made if need be.
+            config_toml: The resolved settings, as TOML.
+            sequence: Where the data is, as `open_sequence` takes it; absolute, or it means another folder tomorrow.
+
+        Raises:
+            ArchiveError: if there is something at `path` already, or the folder cannot be made.
+        """
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise ArchiveError(f"{path} exists and is not an empty folder; choose another one for the run or delete it")
+        try:
+            (path / "submaps").mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ArchiveError(f"cannot make the folder {path} ({error.strerror}); choose another one") from error
+        atomic.write_text(path / "config.toml", config_toml)
+        about = {"kind": "run", "version": archive.VERSION, "sequence": sequence}
+        atomic.write_text(path / "run.json", json.dumps(about, indent=2) + "\n")
+        return RunDirectory(path)
+
+    @staticmethod
+    def open(path: Path) -> "RunDirectory":
+        """The run in an existing folder, finished or not.
+
+        Raises:
+            ArchiveError: if the folder holds no run, or one of another version.
+        """
+        about = _read_json(path / "run.json", f"{path} is not a run; give the folder that `tcgsplat run` wrote")
+        if about.get("kind") != "run" or about.get("version") != archive.VERSION:
+            raise ArchiveError(
+                f"{path} has layout version {about.get('version')}, and this tcgsplat reads version {archive.VERSION}; "
+                "use the tcgsplat that wrote it, or run again"
+            )
+        return RunDirectory(path)
+
+    @property
+    def config_toml(self) -> str:
+        """The resolved settings of the run, as TOML."""
+        try:
+            return (self.path / "config.toml").read_text(encoding="utf-8")
+        except OSError as error:
+            raise ArchiveError(f"cannot read the settings of the run in {self.path} ({error}); run again") from error
+
+    @property
+    def sequence(self) -> str:
+        """Where the data of the run was, as `open_sequence` takes it."""
+        return str(_read_json(self.path / "run.json", f"{self.path} is not a run")["sequence"])
+
+    @property
+    def submap_count(self) -> int:
+        """Sealed submaps on disk, counted from 0 up to the first gap."""
+        count = 0
+        while self._submap_path(count).is_file():
+            count += 1
+        return count
+
+    def write_submap(self, submap: Submap) -> None:
+        """Put a sealed submap on disk."""
+        archive.write_submap(self._submap_path(submap.index), submap)
+
+    def load_submap(self, index: int) -> Submap:
+        """A sealed submap, standing where the last written trajectory has it.
+
+        Raises:
+            ArchiveError: if its file is missing, damaged, or of another version.
+        """
+        submap = archive.read_submap(self._submap_path(index))
+        _, atlas = self.trajectory()
+        return replace(submap, T_world_map=atlas.T_world_map[index]) if index < len(atlas) else submap
+
+    def write_trajectory(self, trajectory: Trajectory, atlas: Atlas) -> None:
+        """Put the path so far on disk, exact (`trajectory.npz`) and in the world as text (`trajectory.txt`)."""
+        rows = trajectory.rows
+        archive.write_arrays(
+            self.path / "trajectory.npz",
+            "trajectory",
+            {
+                "frame_index": np.array([row.frame_index for row in rows], dtype=np.int64),
+                "timestamp": np.array([row.timestamp for row in rows], dtype=np.float64),
+                "submap_index": np.array([row.submap_index for row in rows], dtype=np.int64),
+                "lost": np.array([row.lost for row in rows], dtype=np.bool_),
+                "T_map_cam": _stacked([row.T_map_cam for row in rows]),
+                "T_world_map": _stacked(list(atlas.T_world_map)),
+            },
+        )
+        text = format_tum([row.timestamp for row in rows], trajectory.world(atlas))
+        atomic.write_text(self.path / "trajectory.txt", text)
+
+    def trajectory(self) -> tuple[Trajectory, Atlas]:
+        """The path and the submap poses as last written; both empty if the run has sealed nothing yet.
+
+        Raises:
+            ArchiveError: if the file is damaged or of another version.
+        """
+        path = self.path / "trajectory.npz"
+        if not path.exists():
+            return Trajectory(), Atlas()
+        columns = archive.read_arrays(path, "trajectory")
+        rows = tuple(
+            TrackedPose(int(frame), float(stamp), int(submap), torch.from_numpy(T), bool(lost))
+            for frame, stamp, submap, lost, T in zip(
+                columns["frame_index"],
+                columns["timestamp"],
+                columns["submap_index"],
+                columns["lost"],
+                columns["T_map_cam"],
+                strict=True,
+            )
+        )
+        return Trajectory(rows), Atlas(tuple(torch.from_numpy(T) for T in columns["T_world_map"]))
+
+    def write_summary(self, summary: Mapping[str, object]) -> None:
+        """Say how the run went, once it has ended.
+
+        Args:
+            summary: What JSON can hold. Read by the evaluation: `frames`, `seconds` (wall time of the whole loop) and
+                `peak_rss_mb`; `stage_ms` (stage name to mean milliseconds a frame) and `versions` are for people.
+        """
+        atomic.write_text(self.path / "summary.json", json.dumps(dict(summary), indent=2) + "\n")
+
+    def summary(self) -> dict[str, object]:
+        """How the run went; empty if it has not ended, or was killed.
+
+        Raises:
+            ArchiveError: if the file is there and is not JSON.
+        """
+        path = self.path / "summary.json"
+        return _read_json(path, f"cannot read {path}") if path.exists() else {}
+
+    def _submap_path(self, index: int) -> Path:
+        return self.path / "submaps" / f"{index:04d}.npz"
+
+
+def _stacked(poses: list[Pose]) -> archive.Array:
+    return np.array([T.detach().cpu().numpy() for T in poses], dtype=np.float64).reshape(-1, 4, 4)
+
+
+def _read_json(path: Path, complaint: str) -> dict[str, object]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ArchiveError(f"{complaint} ({error})") from error
+    if not isinstance(content, dict):
+        raise ArchiveError(f"{complaint} ({path} is not a JSON object)")
+    return content
