@@ -1,1 +1,4 @@
-"""Temporal confidence: the paper's Section 3.2 and 3.3 as equations on tensors, and the state that they evolve."""
+"""Temporal confidence: the paper's Sections 3.2 and 3.3.
+
+`equations` holds the formulas, on tensors; `state` holds what is remembered of each Gaussian and composes them.
+"""
