@@ -1,0 +1,410 @@
+"""Sixteen floats as one value inside numba kernels.
+
+`Float32x16` is an LLVM `<16 x float>`: with AVX-512 one register, on other processors LLVM splits it into the widest
+registers there are, with the same results up to the rounding of fused multiply-adds. Loops that keep sums in such
+values across iterations are what numba's own loop vectorisation cannot make.
+
+Only what the kernels need is here: arithmetic by operators (a float or an int beside a vector is spread over the
+lanes), loads and stores on flat float32 arrays, comparisons as 16-bit masks, exp2, and a transposing sum.
+"""
+
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.imputils import lower_builtin
+from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
+from numba.extending import intrinsic, models, register_model
+from numba.np.arrayobj import make_array
+
+LANES = 16
+_F32, _I1, _I16, _I32, _I64 = ir.FloatType(), ir.IntType(1), ir.IntType(16), ir.IntType(32), ir.IntType(64)
+_VF, _VI, _VB = ir.VectorType(_F32, LANES), ir.VectorType(_I32, LANES), ir.VectorType(_I1, LANES)
+
+# Contraction to fused multiply-adds and reciprocals, but no reassociation: exp2's rounding trick must survive.
+_FLAGS = ("contract", "nsz", "arcp")
+MATH = {"contract", "nsz", "arcp"}
+"""The `fastmath` argument of every kernel, for the same reason."""
+
+
+class Float32x16(types.Type):
+    """Numba type of a `<16 x float>`."""
+
+    def __init__(self) -> None:
+        super().__init__(name="Float32x16")
+
+
+float32x16 = Float32x16()
+
+
+@register_model(Float32x16)
+class _Float32x16Model(models.PrimitiveModel):
+    def __init__(self, manager: Any, fe_type: Any) -> None:
+        super().__init__(manager, fe_type, _VF)
+
+
+def _constant(value: float) -> ir.Constant:
+    return ir.Constant(_VF, [float(value)] * LANES)
+
+
+def _spread(builder: Any, scalar: Any) -> Any:
+    undefined = ir.Constant(_VF, ir.Undefined)
+    first = builder.insert_element(undefined, scalar, ir.Constant(_I32, 0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(_VI, [0] * LANES))
+
+
+def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any, pointee: Any) -> Any:
+    data = make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index], inbounds=True), pointee.as_pointer())
+
+
+def _register_operator(op: Callable[..., Any], instruction: str) -> None:
+    """Let `op` take two vectors, or a vector and a scalar on either side."""
+    scalars = (types.float32, types.int64)
+    cases = [signature(float32x16, float32x16, float32x16)]
+    cases += [signature(float32x16, float32x16, scalar) for scalar in scalars]
+    cases += [signature(float32x16, scalar, float32x16) for scalar in scalars]
+    infer_global(op)(type("VectorTemplate", (ConcreteTemplate,), {"cases": cases}))
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        vectors = []
+        for kind, arg in zip(sig.args, args, strict=True):
+            if kind == types.int64:
+                vectors.append(_spread(builder, builder.sitofp(arg, _F32)))
+            else:
+                vectors.append(_spread(builder, arg) if kind == types.float32 else arg)
+        return getattr(builder, instruction)(*vectors, flags=_FLAGS)
+
+    for case in cases:
+        lower_builtin(op, *case.args)(lower)
+
+
+for _op, _instruction in (
+    (operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv"),
+):  # fmt: skip
+    _register_operator(_op, _instruction)
+
+
+@intrinsic
+def spread(typingctx: Any, scalar: Any) -> Any:
+    """Vector with `scalar` in every lane."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _spread(builder, args[0])
+
+    return float32x16(types.float32), lower
+
+
+@intrinsic
+def load(typingctx: Any, array: Any, index: Any) -> Any:
+    """The sixteen floats of a flat array that begin at `index`."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.load(_pointer(context, builder, sig.args[0], args[0], args[1], _VF), align=4)
+
+    return float32x16(array, types.int64), lower
+
+
+@intrinsic
+def store(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
+    """Write sixteen floats to a flat array from `index` on."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        builder.store(args[2], _pointer(context, builder, sig.args[0], args[0], args[1], _VF), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, float32x16), lower
+
+
+@intrinsic
+def store_as_int32(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
+    """Truncate sixteen floats to integers and write them to a flat int32 array."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        integers = builder.fptosi(args[2], _VI)
+        builder.store(integers, _pointer(context, builder, sig.args[0], args[0], args[1], _VI), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, float32x16), lower
+
+
+@intrinsic
+def fma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
+    """A * b + c, fused where the processor can (llvm.fmuladd: never a library call)."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _fma(builder, *args)
+
+    return float32x16(float32x16, float32x16, float32x16), lower
+
+
+def _fma(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    name = f"llvm.fmuladd.v{LANES}f32"
+    return builder.call(
+        cgutils.get_or_insert_function(builder.module, ir.FunctionType(_VF, [_VF] * 3), name), [a, b, c]
+    )
+
+
+@intrinsic
+def minimum(typingctx: Any, a: Any, b: Any) -> Any:
+    """Lane by lane, the smaller."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered("<", args[0], args[1]), args[0], args[1])
+
+    return float32x16(float32x16, float32x16), lower
+
+
+@intrinsic
+def maximum(typingctx: Any, a: Any, b: Any) -> Any:
+    """Lane by lane, the larger."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[0], args[1])
+
+    return float32x16(float32x16, float32x16), lower
+
+
+@intrinsic
+def where_ge(typingctx: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
+    """Lane by lane, `yes` where a >= b, else `no`."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(">=", args[0], args[1]), args[2], args[3])
+
+    return float32x16(float32x16, float32x16, float32x16, float32x16), lower
+
+
+@intrinsic
+def mask_ge(typingctx: Any, a: Any, b: Any) -> Any:
+    """Bit k is set where a >= b in lane k (int32)."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        bits = builder.bitcast(builder.fcmp_ordered(">=", args[0], args[1]), _I16)
+        return builder.zext(bits, _I32)
+
+    return types.int32(float32x16, float32x16), lower
+
+
+@intrinsic
+def sqrt(typingctx: Any, a: Any) -> Any:
+    """Lane by lane square root."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_VF, [_VF]), f"llvm.sqrt.v{LANES}f32")
+        return builder.call(function, [args[0]])
+
+    return float32x16(float32x16), lower
+
+
+@intrinsic
+def floor(typingctx: Any, a: Any) -> Any:
+    """Lane by lane, the largest integer that is not larger."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(_VF, [_VF]), f"llvm.floor.v{LANES}f32"
+        )
+        return builder.call(function, [args[0]])
+
+    return float32x16(float32x16), lower
+
+
+def _exp2_coefficients(degree: int = 5) -> list[float]:
+    """2^x on [-0.5, 0.5] as a polynomial of least relative error (Chebyshev nodes), highest power first."""
+    x = 0.5 * np.cos(np.pi * (np.arange(256) + 0.5) / 256)
+    vandermonde = np.vander(x, degree + 1) / np.exp2(x)[:, None]
+    return [float(c) for c in np.linalg.lstsq(vandermonde, np.ones_like(x), rcond=None)[0]]
+
+
+_EXP2 = _exp2_coefficients()
+
+
+@intrinsic
+def exp2(typingctx: Any, a: Any) -> Any:
+    """2^a for -126 < a < 127, relative error below 3e-7; outside, a meaningless number (select it away).
+
+    Adding 1.5 * 2^23 rounds to the nearest integer in the low bits of the mantissa; shifted into the exponent, those
+    bits scale the polynomial of the remainder.
+    """
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        magic = _constant(12582912.0)
+        shifted = builder.fadd(args[0], magic)  # no flags: must not be folded
+        remainder = builder.fsub(args[0], builder.fsub(shifted, magic))
+        power = _constant(_EXP2[0])
+        for coefficient in _EXP2[1:]:
+            power = _fma(builder, power, remainder, _constant(coefficient))
+        exponent = builder.shl(builder.bitcast(shifted, _VI), ir.Constant(_VI, [23] * LANES))
+        return builder.bitcast(builder.add(builder.bitcast(power, _VI), exponent), _VF)
+
+    return float32x16(float32x16), lower
+
+
+@intrinsic
+def trailing_zeros(typingctx: Any, mask: Any) -> Any:
+    """Index of the lowest set bit of a non-zero int32, as int64."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_I32, [_I32, _I1]), "llvm.cttz.i32")
+        return builder.zext(builder.call(function, [args[0], ir.Constant(_I1, 1)]), _I64)
+
+    return types.int64(types.int32), lower
+
+
+@intrinsic
+def append_where_bit(typingctx: Any, out: Any, count: Any, masks: Any, start: Any, bit: Any, length: Any) -> Any:
+    """Append to `out[count:]` those of start .. start+length-1 whose mask has the bit, in order; gives how many.
+
+    `out` and `masks` are flat int32 arrays with sixteen spare entries at the end; `bit` is the mask's value 1 << b.
+    """
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        out_value, count_value, masks_value, start_value, bit_value, length_value = args
+        lanes = ir.Constant(_VI, list(range(LANES)))
+
+        def spread_int(value: Any) -> Any:
+            undefined = ir.Constant(_VI, ir.Undefined)
+            first = builder.insert_element(undefined, value, ir.Constant(_I32, 0))
+            return builder.shuffle_vector(first, undefined, ir.Constant(_VI, [0] * LANES))
+
+        masks_pointer = _pointer(context, builder, sig.args[2], masks_value, start_value, _VI)
+        has_bit = builder.icmp_signed(
+            "!=",
+            builder.and_(builder.load(masks_pointer, align=4), spread_int(bit_value)),
+            ir.Constant(_VI, [0] * LANES),
+        )
+        inside = builder.icmp_signed("<", lanes, spread_int(length_value))
+        chosen = builder.and_(has_bit, inside)
+        indices = builder.add(lanes, spread_int(builder.trunc(start_value, _I32)))
+        pointer = _pointer(context, builder, sig.args[0], out_value, count_value, _I32)
+        compress = cgutils.get_or_insert_function(
+            builder.module,
+            ir.FunctionType(ir.VoidType(), [_VI, _I32.as_pointer(), _VB]),
+            f"llvm.masked.compressstore.v{LANES}i32",
+        )
+        builder.call(compress, [indices, pointer, chosen])
+        count_bits = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_I16, [_I16]), "llvm.ctpop.i16")
+        return builder.zext(builder.call(count_bits, [builder.bitcast(chosen, _I16)]), _I64)
+
+    sig = types.int64(out, types.int64, masks, types.int64, types.int32, types.int32)
+    return sig, lower
+
+
+@intrinsic
+def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
+    """Ask for the cache line of `array[index]`; the index must be inside."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        byte_pointer = ir.IntType(8).as_pointer()
+        pointer = builder.bitcast(
+            _pointer(context, builder, sig.args[0], args[0], args[1], ir.IntType(8)), byte_pointer
+        )
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(ir.VoidType(), [byte_pointer, _I32, _I32, _I32]), "llvm.prefetch.p0"
+        )
+        builder.call(function, [pointer, ir.Constant(_I32, 0), ir.Constant(_I32, 3), ir.Constant(_I32, 1)])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64), lower
+
+
+def _halves(group: int) -> tuple[list[int], list[int]]:
+    """Shuffle indices that put, in each group of 2*group lanes, the low (high) halves of two vectors side by side."""
+    low: list[int] = []
+    high: list[int] = []
+    for base in range(0, LANES, 2 * group):
+        low += [base + k for k in range(group)] + [LANES + base + k for k in range(group)]
+        high += [base + group + k for k in range(group)] + [LANES + base + group + k for k in range(group)]
+    return low, high
+
+
+def _sum_tree(builder: Any, vectors: Sequence[Any]) -> Any:
+    """One vector whose lane k is the sum over the lanes of vector k: log2(16) rounds of halving, in fixed order."""
+    level: list[Any] = [*vectors, *([None] * (LANES - len(vectors)))]
+    zero = _constant(0.0)
+    for group in (8, 4, 2, 1):
+        low, high = (ir.Constant(_VI, indices) for indices in _halves(group))
+        half = len(level) // 2
+        merged = []
+        for a, b in zip(level[:half], level[half:], strict=True):
+            if a is None:
+                merged.append(None)
+                continue
+            b_or_zero = zero if b is None else b
+            merged.append(
+                builder.fadd(
+                    builder.shuffle_vector(a, b_or_zero, low), builder.shuffle_vector(a, b_or_zero, high), flags=_FLAGS
+                )
+            )
+        level = merged
+    return level[0]
+
+
+@intrinsic
+def lane_sums(typingctx: Any, vectors: Any) -> Any:
+    """Vector whose lane k holds the sum of all lanes of the k-th vector of a tuple (up to sixteen; the rest 0)."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _sum_tree(builder, [builder.extract_value(args[0], k) for k in range(sig.args[0].count)])
+
+    return float32x16(vectors), lower
+
+
+@intrinsic
+def sum_lanes(typingctx: Any, a: Any) -> Any:
+    """Sum over the sixteen lanes, in a fixed order."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.extract_element(_sum_tree(builder, [args[0]]), ir.Constant(_I32, 0))
+
+    return types.float32(float32x16), lower
+
+
+def _transposed(builder: Any, rows: Sequence[Any]) -> list[Any]:
+    """Sixteen vectors as the rows of a matrix, transposed by four rounds of butterfly shuffles."""
+    vectors = list(rows)
+    for group in (1, 2, 4, 8):
+        even = [lane if not lane & group else LANES + (lane ^ group) for lane in range(LANES)]
+        odd = [lane | group if not lane & group else LANES + lane for lane in range(LANES)]
+        swapped: list[Any] = [None] * LANES
+        for row in range(LANES):
+            if row & group:
+                continue
+            a, b = vectors[row], vectors[row | group]
+            swapped[row] = builder.shuffle_vector(a, b, ir.Constant(_VI, even))
+            swapped[row | group] = builder.shuffle_vector(a, b, ir.Constant(_VI, odd))
+        vectors = swapped
+    return vectors
+
+
+@intrinsic
+def store_transposed(typingctx: Any, array: Any, index: Any, columns: Any) -> Any:
+    """Write a tuple of sixteen vectors as the columns of a row-major 16 x 16 matrix that begins at `index`."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        rows = _transposed(builder, [builder.extract_value(args[2], k) for k in range(LANES)])
+        for number, row in enumerate(rows):
+            at = builder.add(args[1], ir.Constant(_I64, number * LANES))
+            builder.store(row, _pointer(context, builder, sig.args[0], args[0], at, _VF), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, columns), lower
+
+
+@intrinsic
+def load_transposed(typingctx: Any, array: Any, index: Any) -> Any:
+    """The columns of the row-major 16 x 16 matrix that begins at `index`, as a tuple of vectors."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        rows = []
+        for number in range(LANES):
+            at = builder.add(args[1], ir.Constant(_I64, number * LANES))
+            rows.append(builder.load(_pointer(context, builder, sig.args[0], args[0], at, _VF), align=4))
+        return context.make_tuple(builder, sig.return_type, _transposed(builder, rows))
+
+    return types.UniTuple(float32x16, LANES)(array, types.int64), lower

@@ -1,0 +1,92 @@
+"""From a submap and a camera to meaningful images: the one place where Gaussians become splats.
+
+Colour and confidence are composited as channels of one pass, so that Eq. 17's map has the very weights of the picture.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+from tcgsplat.geometry import se3
+from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.protocol import MAX_OPACITY, Rasterizer, Splats
+from tcgsplat.scene.gaussians import Gaussians
+from tcgsplat.scene.submap import Submap
+from tcgsplat.tensors import Image, PerGaussian, PerGaussianFlag, Plane, Pose
+
+MIN_COVERAGE = 0.5
+"""Below this alpha most of the pixel is unmapped, and a depth divided by alpha would be a guess."""
+
+DepthMode = Literal["composited", "expected", "planar"]
+"""Which depth a loss compares with the sensor: composited with alpha as the paper has it; that divided by alpha; or
+the splats' planes divided by alpha."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What one view of a map looks like."""
+
+    color: Image
+    """RGB times alpha: black where nothing is mapped."""
+    composited_depth: Plane
+    """Centre depth times alpha, metres."""
+    composited_plane_depth: Plane
+    """Plane depth times alpha, metres."""
+    alpha: Plane
+    """In [0, 1)."""
+    confidence: Plane
+    """P of Eq. 17, in [0, alpha]; never carries a gradient."""
+    visible: PerGaussianFlag
+
+    @property
+    def depth(self) -> Plane:
+        """The surface's depth: planes divided by alpha, metres; 0 where coverage is below MIN_COVERAGE."""
+        covered = self.alpha > MIN_COVERAGE
+        return torch.where(covered, self.composited_plane_depth / self.alpha.clamp_min(MIN_COVERAGE), 0.0)
+
+    def depth_as(self, mode: DepthMode) -> Plane:
+        """Depth for a loss, metres; where it is divided by alpha, thin coverage keeps it finite."""
+        if mode == "composited":
+            return self.composited_depth
+        depth = self.composited_plane_depth if mode == "planar" else self.composited_depth
+        return depth / self.alpha.clamp_min(1e-3)
+
+
+def render(
+    gaussians: Gaussians,
+    confidence: PerGaussian,
+    camera: Camera,
+    T_cam_map: Pose,
+    rasterizer: Rasterizer,
+) -> Rendering:
+    """Draw Gaussians, differentiable in all of their parameters and in the pose.
+
+    Args:
+        gaussians: n Gaussians in the map frame.
+        confidence: p of each, composited alongside; detached, or tracking could lower its loss by moving towards
+            doubtful regions.
+        camera: Intrinsics.
+        T_cam_map: Map frame to camera frame.
+        rasterizer: Backend.
+    """
+    viewpoint = se3.inverse(T_cam_map)[:3, 3].to(gaussians.means)
+    features = torch.cat((gaussians.colors(viewpoint), confidence.detach()[:, None]), dim=1)
+    splats = Splats(
+        gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities.clamp_max(MAX_OPACITY), features
+    )
+    raster = rasterizer(splats, camera, T_cam_map)
+    return Rendering(
+        color=raster.features[..., :3],
+        composited_depth=raster.depth,
+        composited_plane_depth=raster.plane_depth,
+        alpha=raster.alpha,
+        confidence=raster.features[..., 3].detach(),
+        visible=raster.visible,
+    )
+
+
+@torch.no_grad()
+def render_view(submap: Submap, camera: Camera, T_map_cam: Pose, rasterizer: Rasterizer) -> Rendering:
+    """Draw a submap from a camera in its frame, without gradients."""
+    return render(submap.gaussians, submap.confidence.value, camera, se3.inverse(T_map_cam), rasterizer)

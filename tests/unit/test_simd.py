@@ -1,0 +1,105 @@
+import math
+
+import numpy as np
+import pytest
+from numba import njit
+
+from tcgsplat.render.numba_cpu import simd
+
+
+@njit(fastmath=simd.MATH)
+def _arithmetic(a, b, out):
+    x, y = simd.load(a, 0), simd.load(b, 0)
+    simd.store(out, 0, x + y)
+    simd.store(out, 16, x - y * np.float32(2))
+    simd.store(out, 32, 3 * x / y)
+    simd.store(out, 48, simd.fma(x, y, simd.spread(np.float32(1))))
+    simd.store(out, 64, simd.minimum(x, y))
+    simd.store(out, 80, simd.maximum(x, y))
+    simd.store(out, 96, simd.where_ge(x, y, x, simd.spread(np.float32(-7))))
+    simd.store(out, 112, simd.sqrt(y))
+    simd.store(out, 128, simd.floor(x))
+    return simd.mask_ge(x, y), simd.sum_lanes(x)
+
+
+def test_arithmetic_is_lane_by_lane():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=16).astype(np.float32), rng.uniform(0.5, 2, 16).astype(np.float32)
+    out = np.zeros(144, np.float32)
+    mask, total = _arithmetic(a, b, out)
+    rows = out.reshape(9, 16)
+    expected = [a + b, a - 2 * b, 3 * a / b, a * b + 1, np.minimum(a, b), np.maximum(a, b), np.where(a >= b, a, -7)]
+    expected += [np.sqrt(b), np.floor(a)]
+    for row, values in zip(rows, expected, strict=True):
+        np.testing.assert_allclose(row, values, rtol=3e-7, atol=1e-7)
+    assert mask == sum(1 << k for k in range(16) if a[k] >= b[k])
+    assert total == pytest.approx(a.sum(), abs=1e-6)
+
+
+@njit(fastmath=simd.MATH)
+def _exp2(a, out):
+    for i in range(0, a.size, 16):
+        simd.store(out, i, simd.exp2(simd.load(a, i)))
+
+
+def test_exp2_is_accurate_over_the_range_that_the_kernels_use():
+    a = np.linspace(-20, 20, 1 << 14).astype(np.float32)
+    out = np.empty_like(a)
+    _exp2(a, out)
+    relative = np.abs(out.astype(np.float64) / np.exp2(a.astype(np.float64)) - 1)
+    assert relative.max() < 3e-7
+
+
+@njit(fastmath=simd.MATH)
+def _sums(rows, out):
+    simd.store(out, 0, simd.lane_sums((simd.load(rows, 0), simd.load(rows, 16), simd.load(rows, 32))))
+
+
+def test_lane_sums_puts_each_total_in_its_lane():
+    rows = np.arange(48, dtype=np.float32)
+    out = np.full(16, -1, np.float32)
+    _sums(rows, out)
+    np.testing.assert_array_equal(out, [*rows.reshape(3, 16).sum(1), *[0] * 13])
+
+
+@njit(fastmath=simd.MATH)
+def _transpose(matrix, out):
+    simd.store_transposed(out, 0, simd.load_transposed(matrix, 0))
+    simd.store(out, 256, simd.load_transposed(matrix, 0)[3])
+
+
+def test_transposed_load_and_store_are_inverse():
+    matrix = np.arange(256, dtype=np.float32)
+    out = np.zeros(272, np.float32)
+    _transpose(matrix, out)
+    np.testing.assert_array_equal(out[:256], matrix)
+    np.testing.assert_array_equal(out[256:], matrix.reshape(16, 16)[:, 3])
+
+
+@njit
+def _append(out, masks, start, bit, length):
+    return simd.append_where_bit(out, 2, masks, start, np.int32(bit), np.int32(length))
+
+
+@pytest.mark.parametrize("length", [16, 5, 0])
+def test_append_where_bit_keeps_order_and_length(length):
+    rng = np.random.default_rng(1)
+    masks = rng.integers(0, 8, 48).astype(np.int32)
+    out = np.full(40, -1, np.int32)
+    count = _append(out, masks, 16, 2, length)
+    expected = [i for i in range(16, 16 + length) if masks[i] & 2]
+    assert count == len(expected)
+    assert out[2 : 2 + count].tolist() == expected
+
+
+@njit
+def _integers(values, out):
+    simd.store_as_int32(out, 0, simd.load(values, 0))
+    return simd.trailing_zeros(np.int32(40))
+
+
+def test_integers():
+    out = np.zeros(16, np.int32)
+    values = np.linspace(-3, 40, 16).astype(np.float32)
+    assert _integers(values, out) == int(math.log2(8))
+    np.testing.assert_array_equal(out, values.astype(np.int32))
