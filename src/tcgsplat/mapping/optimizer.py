@@ -1,0 +1,96 @@
+"""Adam on rows: one optimiser for all parameters of the Gaussians, with a step scale for each Gaussian (Eq. 24).
+
+Adam divides a gradient by its own running size, so a constant factor on one Gaussian's gradients cancels: scaling
+gradients, as the paper's text has it, changes nothing. The factor that has the effect the text describes multiplies
+the step.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from tcgsplat.scene.gaussians import Gaussians
+from tcgsplat.tensors import PerGaussian, PerGaussianFlag
+
+GEOMETRY = ("means", "log_scales", "quats")
+"""What Eq. 24 scales."""
+PARAMETERS = (*GEOMETRY, "logit_opacities", "sh")
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """Adam step sizes, in the parameters' own units. [base] throughout, where not said otherwise."""
+
+    means: float = 1e-4
+    """Metres."""
+    log_scales: float = 5e-3
+    quats: float = 1e-3
+    logit_opacities: float = 0.05
+    sh: float = 2.5e-3
+    """Constant harmonic; higher ones get a twentieth, as in the base system."""
+
+
+BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
+
+
+class RowAdam:
+    """Adam over a set of Gaussians whose rows stay the same for the life of the optimiser.
+
+    The only mutable thing of mapping: made for one mapping update, dropped after it.
+    """
+
+    def __init__(self, gaussians: Gaussians, rates: LearningRates) -> None:
+        self._rates = rates
+        self._parameters = {name: getattr(gaussians, name).clone().requires_grad_() for name in PARAMETERS}
+        self._first = {name: torch.zeros_like(p) for name, p in self._parameters.items()}
+        self._second = {name: torch.zeros_like(p) for name, p in self._parameters.items()}
+        self._steps = 0
+        self._template = gaussians
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The Gaussians as they are now; differentiable leaves."""
+        return replace(self._template, **self._parameters)
+
+    def detached(self) -> Gaussians:
+        """The Gaussians as they are now, as plain values."""
+        return replace(self._template, **{name: p.detach() for name, p in self._parameters.items()})
+
+    def step(self, loss: Tensor, frozen: tuple[str, ...] = (), gradient_scale: PerGaussian | None = None,
+             step_scale: PerGaussian | None = None) -> None:  # fmt: skip
+        """Follow the gradient of `loss` by one Adam step.
+
+        Args:
+            loss: Scalar that depends on `gaussians`.
+            frozen: Names of parameters that stay.
+            gradient_scale: Eq. 24 to the letter: multiplies the geometry's gradients.
+            step_scale: Eq. 24 as it is meant: multiplies the geometry's steps.
+        """
+        active = [name for name in PARAMETERS if name not in frozen]
+        gradients = torch.autograd.grad(loss, [self._parameters[name] for name in active], allow_unused=True)
+        self._steps += 1
+        correction_1, correction_2 = 1 - BETA_1**self._steps, 1 - BETA_2**self._steps
+        with torch.no_grad():
+            for name, gradient in zip(active, gradients, strict=True):
+                if gradient is None:
+                    continue
+                g = torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)  # one bad pixel must not end a map
+                if name in GEOMETRY and gradient_scale is not None:
+                    g = g * gradient_scale[:, None]
+                first = self._first[name].lerp_(g, 1 - BETA_1)
+                second = self._second[name].mul_(BETA_2).addcmul_(g, g, value=1 - BETA_2)
+                step = first / (second / correction_2).sqrt_().add_(EPSILON)
+                if name in GEOMETRY and step_scale is not None:
+                    step *= step_scale[:, None]
+                if name == "sh":
+                    step[:, 1:] *= 0.05
+                self._parameters[name].sub_(step, alpha=getattr(self._rates, name) / correction_1)
+
+    def kept(self, keep: PerGaussianFlag) -> "RowAdam":
+        """The optimiser of the flagged rows only, moments included."""
+        smaller = RowAdam(self.detached().kept(keep), self._rates)
+        smaller._first = {name: moment[keep] for name, moment in self._first.items()}
+        smaller._second = {name: moment[keep] for name, moment in self._second.items()}
+        smaller._steps = self._steps
+        return smaller

@@ -1,0 +1,55 @@
+"""When to map, and when to begin a new submap."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from tcgsplat.errors import ConfigError
+from tcgsplat.geometry import se3
+from tcgsplat.scene.submap import Submap
+from tcgsplat.tensors import Pose
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """Rhythm of mapping and size of submaps."""
+
+    map_every: int = 5
+    """Frames from one mapping update to the next; the first frame of a submap is always mapped. [base: Replica 5]"""
+    submap_by: Literal["motion", "interval"] = "motion"
+    """What ends a submap: camera motion since its first frame, or a number of frames. [paper]"""
+    submap_distance: float = 0.5
+    """Metres from the submap's first camera that end it. [paper]"""
+    submap_angle: float = 50.0
+    """Degrees of rotation from the submap's first camera that end it. [paper] (the base system tests Euler angles)"""
+    submap_interval: int = 50
+    """Frames that end a submap, where it is ended by frames. [paper: ScanNet]"""
+
+    def __post_init__(self) -> None:
+        for name in ("map_every", "submap_distance", "submap_angle", "submap_interval"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"schedule.{name} is {getattr(self, name)!r}; it must be above 0")
+        if self.submap_by not in ("motion", "interval"):
+            raise ConfigError(f"schedule.submap_by is {self.submap_by!r}; choose motion or interval")
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Decisions on rhythm, from the submap alone."""
+
+    config: ScheduleConfig
+
+    def switches_submap(self, frame_index: int, T_map_cam: Pose, submap: Submap) -> bool:
+        """Whether a frame tracked at `T_map_cam` begins a new submap. Before anything is mapped, none does."""
+        if not submap.keyframes:
+            return False
+        if self.config.submap_by == "interval":
+            return frame_index - submap.keyframes[0].frame.index >= self.config.submap_interval
+        far = se3.translation_norm(T_map_cam) > self.config.submap_distance
+        return far or math.degrees(se3.rotation_angle(T_map_cam)) > self.config.submap_angle
+
+    def maps(self, frame_index: int, submap: Submap) -> bool:
+        """Whether this frame is mapped: every `map_every` frames since the last one that was."""
+        if not submap.keyframes:
+            return True
+        return frame_index - submap.keyframes[-1].frame.index >= self.config.map_every

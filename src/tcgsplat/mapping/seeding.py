@@ -1,0 +1,254 @@
+"""Where the map needs new Gaussians, and what they are at birth.
+
+Two recipes: `surface` places discs on the measured surface, one for every few pixels, flat along the normal and
+stretched so that they look round from where they were seen; `points` is the base system's: random pixels (more of
+them where the picture has edges), round blobs as large as their neighbours are apart.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from tcgsplat.errors import ConfigError
+from tcgsplat.geometry import quaternion, se3
+from tcgsplat.render.view import Rendering
+from tcgsplat.scene.frame import Frame
+from tcgsplat.scene.gaussians import SH_C0, Gaussians
+from tcgsplat.tensors import Mask, Plane, Pose
+
+
+@dataclass(frozen=True)
+class SeedingConfig:
+    """Where and how Gaussians are born."""
+
+    recipe: Literal["surface", "points"] = "surface"
+    """Discs on the surface [ours], or the base system's points [base]."""
+    min_alpha: float = 0.6
+    """Pixels covered less are unmapped. [base]"""
+    opacity: float = 0.9
+    """At birth. [ours] (base: 0.5)"""
+    push_back: float = 0.0
+    """Share of the depth by which seeds are set behind the measured point. [ours] (base: 0.005)"""
+    spacing: int = 2
+    """`surface`: one seed for every so many pixels: 1 all, 2 a checkerboard, 4 every second row and column. [ours]"""
+    footprint: float = 0.5
+    """`surface`: standard deviation at birth, in pixels, for a seed at every pixel's distance; grows with the root of
+    `spacing / 2`. With the renderer's blur of 0.3 px^2 a checkerboard of them is closed and still sharp. [ours]"""
+    flatness: float = 0.2
+    """`surface`: thickness over the smaller of the other two. [ours]"""
+    behind: float = 0.1
+    """`surface`: a pixel whose rendered depth lies this much behind the sensor, metres, shows a new surface in front:
+    twenty times the depth noise at 1.5 m. [ours]"""
+    behind_medians: float = 40.0
+    """`points`: the same in medians of the depth error. [base]"""
+    first_points: int = 100_000
+    """`points`: uniform samples of a new submap's first frame. [base: TUM]"""
+    first_gradient_points: int = 50_000
+    """`points`: samples by image gradient of a new submap's first frame. [base]"""
+    points: int = 30_000
+    """`points`: at most so many seeds in later frames; 0 for all. [base: TUM]"""
+
+    def __post_init__(self) -> None:
+        if self.recipe not in ("surface", "points"):
+            raise ConfigError(f"seeding.recipe is {self.recipe!r}; choose surface or points")
+        if self.spacing not in (1, 2, 4):
+            raise ConfigError(f"seeding.spacing is {self.spacing!r}; choose 1, 2 or 4")
+        if not 0 < self.opacity < 1:
+            raise ConfigError(f"seeding.opacity is {self.opacity!r}; it must be above 0 and below 1")
+
+
+class IdSource:
+    """Unique Gaussian ids for one run."""
+
+    def __init__(self, first: int = 0) -> None:
+        self._next = first
+
+    def take(self, count: int) -> Tensor:
+        """The next `count` ids, int64."""
+        ids = torch.arange(self._next, self._next + count)
+        self._next += count
+        return ids
+
+
+def surface_normals(depth: Plane, frame: Frame) -> Float[Tensor, "h w 3"]:
+    """Unit normals of a depth image in the camera frame, towards the camera; the viewing ray's where unknown.
+
+    Depth is averaged over 5 x 5 readings first, where that average stays within 3 % of the reading: noise is an order
+    larger than the slope between two pixels.
+    """
+    readings = (depth > 0).float()
+    window = torch.ones(1, 1, 5, 5) / 25.0
+    sums = torch.nn.functional.conv2d(torch.stack((depth, readings))[:, None], window, padding=2)[:, 0]
+    mean = sums[0] / sums[1].clamp_min(1e-6)
+    smooth = torch.where((depth > 0) & ((mean - depth).abs() < 0.03 * depth), mean, depth)
+
+    rays = frame.camera.rays()
+    points = rays * smooth[..., None]
+    du = points[1:-1, 2:] - points[1:-1, :-2]
+    dv = points[2:, 1:-1] - points[:-2, 1:-1]
+    inner = torch.nn.functional.normalize(torch.linalg.cross(dv, du), dim=-1)
+    normals = torch.nn.functional.pad(inner.permute(2, 0, 1), (1, 1, 1, 1)).permute(1, 2, 0)
+    facing = -(normals * torch.nn.functional.normalize(rays, dim=-1)).sum(dim=-1)
+    neighbors = torch.nn.functional.max_pool2d(-readings[None], 3, stride=1, padding=1)[0] < 0  # all nine have one
+    known = neighbors & (facing > 0.15)
+    return torch.where(known[..., None], normals, -torch.nn.functional.normalize(rays, dim=-1))
+
+
+def needed(frame: Frame, rendering: Rendering | None, config: SeedingConfig) -> Mask:
+    """Pixels with a reading at which the map has no surface, or one that lies behind what is seen now."""
+    measured = frame.valid & (frame.depth > 0)
+    if rendering is None:
+        return measured
+    unmapped = rendering.alpha < config.min_alpha
+    if config.recipe == "surface":
+        hidden_by_new = (rendering.depth > 0) & (rendering.depth - frame.depth > config.behind)
+    else:
+        error = torch.where(frame.depth > 0, (frame.depth - rendering.composited_depth).abs(), 0.0)
+        hidden_by_new = (rendering.composited_depth > frame.depth) & (error > config.behind_medians * error.median())
+    return measured & (unmapped | hidden_by_new)
+
+
+def seed(
+    frame: Frame,
+    T_map_cam: Pose,
+    rendering: Rendering | None,
+    existing: Gaussians,
+    ids: IdSource,
+    generator: torch.Generator,
+    config: SeedingConfig,
+) -> Gaussians:
+    """New Gaussians in the map frame for what a frame shows and the map lacks.
+
+    Args:
+        frame: The frame to be mapped.
+        T_map_cam: Its pose.
+        rendering: The map seen from there, or None for the first frame of a submap.
+        existing: The map's Gaussians (their spacing sets sizes in the `points` recipe).
+        ids: Source of unique ids.
+        generator: Randomness of the `points` recipe.
+        config: Recipe and constants.
+    """
+    mask = needed(frame, rendering, config)
+    if config.recipe == "surface":
+        return _surface_seeds(frame, T_map_cam, mask, existing.sh_degree, ids, config)
+    return _point_seeds(frame, T_map_cam, mask, rendering is None, existing, ids, generator, config)
+
+
+def _lattice(height: int, width: int, spacing: int) -> Mask:
+    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    if spacing == 1:
+        return torch.ones(height, width, dtype=torch.bool)
+    if spacing == 2:
+        return (u + v) % 2 == 0
+    return (u % 2 == 0) & (v % 2 == 0)
+
+
+def _born(
+    means: Tensor, log_scales: Tensor, quats: Tensor, colors: Tensor, sh_degree: int, ids: IdSource, opacity: float
+) -> Gaussians:
+    n = len(means)
+    sh = torch.zeros(n, (sh_degree + 1) ** 2, 3)
+    sh[:, 0] = (colors - 0.5) / SH_C0
+    return Gaussians(
+        ids=ids.take(n),
+        means=means.float(),
+        log_scales=log_scales.float(),
+        quats=quats.float(),
+        logit_opacities=torch.full((n,), float(np.log(opacity / (1 - opacity)))),
+        sh=sh,
+    )
+
+
+def _surface_seeds(
+    frame: Frame, T_map_cam: Pose, mask: Mask, sh_degree: int, ids: IdSource, config: SeedingConfig
+) -> Gaussians:
+    chosen = mask & _lattice(*mask.shape, config.spacing)
+    depth = frame.depth[chosen]
+    points = (frame.camera.rays() * frame.depth[..., None])[chosen] * (1 + config.push_back)
+    normals = surface_normals(frame.depth, frame)[chosen]
+    rays = torch.nn.functional.normalize(points, dim=-1)
+    facing = -(normals * rays).sum(dim=-1).clamp(-1.0, -0.0)  # cosine between normal and viewing direction, >= 0
+
+    # Own axes: along the tilt, across it, along the normal. A disc seen at an angle is shortened along the tilt; it is
+    # stretched by as much (at most three times), so that the lattice stays closed.
+    across = torch.linalg.cross(normals, rays)
+    upright = across.norm(dim=-1, keepdim=True) < 1e-4
+    across = torch.where(upright, torch.linalg.cross(normals, torch.tensor([0.0, 1.0, 0.0]).expand_as(normals)), across)
+    across = torch.nn.functional.normalize(across, dim=-1)
+    along = torch.linalg.cross(across, normals)
+    axes = torch.stack((along, across, normals), dim=-1)
+    size = config.footprint * (config.spacing / 2) ** 0.5 * depth / frame.camera.fx
+    stretch = 1 / facing.clamp_min(1 / 3)
+    scales = torch.stack((size * stretch, size, size * config.flatness), dim=-1)
+
+    R = T_map_cam[:3, :3].float()
+    return _born(
+        se3.transform(T_map_cam, points),
+        scales.log(),
+        quaternion.from_matrix(R @ axes),
+        frame.color[chosen],
+        sh_degree,
+        ids,
+        config.opacity,
+    )
+
+
+def _point_seeds(
+    frame: Frame,
+    T_map_cam: Pose,
+    mask: Mask,
+    first: bool,
+    existing: Gaussians,
+    ids: IdSource,
+    generator: torch.Generator,
+    config: SeedingConfig,
+) -> Gaussians:
+    measured = frame.valid & (frame.depth > 0)
+    if first:
+        chosen = _first_frame_pixels(frame, generator, config) & measured
+        picked = chosen.flatten().nonzero().flatten()
+    else:
+        candidates = mask.flatten().nonzero().flatten()
+        order = torch.randperm(len(candidates), generator=generator)
+        limit = config.points or len(candidates)
+        picked = candidates[order[:limit]].sort().values
+    points = ((frame.camera.rays() * frame.depth[..., None]).flatten(0, 1)[picked]) * (1 + config.push_back)
+    means = se3.transform(T_map_cam, points)
+    everything = torch.cat((existing.means, means)).numpy()
+    if len(everything) > 3:
+        distances = cKDTree(everything).query(means.numpy(), k=4)[0][:, 1:]
+        spread = torch.from_numpy((distances**2).mean(axis=1)).clamp_min(1e-7).sqrt()
+    else:
+        spread = torch.full((len(means),), 0.01)
+    n = len(means)
+    return _born(
+        means,
+        spread.log()[:, None].expand(n, 3),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(n, 4).clone(),
+        frame.color.flatten(0, 1)[picked],
+        existing.sh_degree,
+        ids,
+        config.opacity,
+    )
+
+
+def _first_frame_pixels(frame: Frame, generator: torch.Generator, config: SeedingConfig) -> Mask:
+    """Uniform pixels, pixels by image gradient, and all pixels on edges (the base system's new submap)."""
+    gray = (frame.color @ torch.tensor([0.299, 0.587, 0.114])).numpy()
+    gray_8bit = np.clip(255 * gray, 0, 255).astype(np.uint8)
+    edges = cv2.dilate(cv2.Canny(gray_8bit, 100, 200, L2gradient=True), np.ones((2, 2), np.uint8)) > 0
+    chosen = torch.from_numpy(edges).flatten().clone()
+    uniform = torch.randperm(chosen.numel(), generator=generator)[: config.first_points]
+    chosen[uniform] = True
+    slope = np.hypot(cv2.Sobel(gray, cv2.CV_64F, 1, 0), cv2.Sobel(gray, cv2.CV_64F, 0, 1)).ravel()
+    if config.first_gradient_points and slope.sum() > 0:
+        cumulative = torch.from_numpy(np.cumsum(slope) / slope.sum())
+        draws = torch.rand(config.first_gradient_points, generator=generator, dtype=torch.float64)
+        chosen[torch.searchsorted(cumulative, draws).clamp_max(chosen.numel() - 1)] = True
+    return chosen.reshape(gray.shape)

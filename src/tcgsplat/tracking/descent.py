@@ -1,0 +1,117 @@
+"""The paper's solver: Adam on the camera pose, through the rasterizer (Section 3.3, Eqs. 17 to 19).
+
+The map stands still. Each iteration renders colour, depth, alpha and confidence at the current pose and follows the
+gradient of the confidence-weighted residual. The base system turns the camera about the world's origin; here the
+increment turns it about its own centre, which keeps rotation and translation apart wherever the camera is.
+"""
+
+from dataclasses import dataclass
+
+import torch
+
+from tcgsplat.confidence import equations as eq
+from tcgsplat.geometry import quaternion, se3
+from tcgsplat.render.losses import color_error, depth_error
+from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.render.view import DepthMode, Rendering, render
+from tcgsplat.scene.frame import Frame
+from tcgsplat.scene.submap import Submap
+from tcgsplat.tensors import Plane, Pose
+
+
+@dataclass(frozen=True)
+class DescentConfig:
+    """Constants of the solver; the defaults are the base system's for TUM RGB-D."""
+
+    iterations: int = 200
+    """Adam steps a frame. [base]"""
+    rotation_rate: float = 0.002
+    """Step of the increment's quaternion. [base]"""
+    translation_rate: float = 0.01
+    """Step of the increment's translation, metres. [base]"""
+    color_weight: float = 0.6
+    """lambda_c of Eq. 19, over the three channels' sum; depth gets 1 - lambda_c per metre. [base]"""
+    depth_mode: DepthMode = "composited"
+    """The depth that is compared with the sensor. [base]"""
+    soft_alpha: bool = True
+    """Weight residuals by alpha cubed: what is hardly mapped hardly counts. [base]"""
+    min_alpha: float = 0.0
+    """Pixels covered less are left out; the base system uses 0.98 on ScanNet. [base]"""
+    outlier_factor: float = 0.0
+    """Leave out pixels whose depth error exceeds this many medians (50 on Replica and ScanNet); 0 for never. [base]"""
+    mask_color: bool = True
+    """Let the mask of valid depth count for colour too. [base]"""
+
+
+def weighted_residual(rendering: Rendering, weight: Plane, frame: Frame, config: DescentConfig) -> torch.Tensor:
+    """The loss of Eq. 19 at one pose: masked and weighted colour and depth residuals, summed over pixels."""
+    depth = rendering.depth_as(config.depth_mode)
+    residual_depth = depth_error(depth, frame.depth)
+    mask = frame.valid & (frame.depth > 0)
+    with torch.no_grad():
+        if config.min_alpha > 0:
+            mask = mask & (rendering.alpha > config.min_alpha)
+        if config.outlier_factor > 0:
+            median = residual_depth.median()
+            if median > 0:
+                mask = mask & (residual_depth < config.outlier_factor * median)
+        soft = rendering.alpha**3 if config.soft_alpha else torch.ones_like(rendering.alpha)
+        color_mask = mask if config.mask_color else frame.valid
+    return eq.tracking_loss(
+        weight * soft,
+        3 * color_error(rendering.color, frame.color) * color_mask,
+        residual_depth * mask,
+        color_weight=config.color_weight,
+        depth_weight=1.0 - config.color_weight,
+    )
+
+
+@dataclass(frozen=True)
+class Descent:
+    """What the solver found."""
+
+    T_map_cam: Pose
+    iterations: int
+    loss: float
+    """The smallest value of Eq. 19 that was met."""
+    rendering: Rendering
+    """The map at the pose with that value."""
+
+
+def descend(
+    frame: Frame, submap: Submap, guess: Pose, rasterizer: Rasterizer, config: DescentConfig, *, floor: float | None
+) -> Descent:
+    """Minimise the weighted residual over the pose.
+
+    Args:
+        frame: Live frame.
+        submap: The map, which stays as it is.
+        guess: `T_map_cam` to start from.
+        rasterizer: Backend with pose gradients.
+        config: Constants.
+        floor: w_min of Eq. 18; None weighs every pixel by 1 (the base system).
+    """
+    gaussians = submap.gaussians
+    T_cam_map_guess = se3.inverse(guess)
+    q = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
+    t = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    adam = torch.optim.Adam(
+        [{"params": [q], "lr": config.rotation_rate}, {"params": [t], "lr": config.translation_rate}], amsgrad=True
+    )
+    best: Descent | None = None
+    for iteration in range(config.iterations):
+        T_cam_map = se3.from_rotation_translation(quaternion.to_matrix(q), t) @ T_cam_map_guess
+        rendering = render(gaussians, submap.confidence.value, frame.camera, T_cam_map, rasterizer)
+        weight = (
+            torch.ones_like(rendering.alpha) if floor is None else eq.tracking_weight(rendering.confidence, floor=floor)
+        )
+        loss = weighted_residual(rendering, weight, frame, config)
+        value = float(loss.detach())
+        if best is None or value < best.loss:
+            best = Descent(se3.inverse(T_cam_map.detach()), iteration + 1, value, rendering)
+        adam.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        adam.step()
+    if best is None:
+        raise ValueError("descent needs at least one iteration")
+    return Descent(best.T_map_cam, config.iterations, best.loss, best.rendering)

@@ -1,0 +1,116 @@
+"""Tracking: one frame against the standing submap, by the solver that the configuration names.
+
+A failure is a result: the frame is reported lost, keeps the predicted pose, and is not mapped.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+
+from tcgsplat.confidence import equations as eq
+from tcgsplat.confidence.state import ConfidenceConfig
+from tcgsplat.errors import ConfigError
+from tcgsplat.geometry import se3
+from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.render.view import Rendering, render_view
+from tcgsplat.scene.frame import Frame
+from tcgsplat.scene.submap import Submap
+from tcgsplat.tensors import Pose
+from tcgsplat.tracking.alignment import AlignmentConfig, align
+from tcgsplat.tracking.descent import DescentConfig, descend
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """Which solver, and when its answer is not believed."""
+
+    solver: Literal["alignment", "descent"] = "alignment"
+    """`alignment`: Gauss-Newton against one render; `descent`: the paper's Adam through the rasterizer. [ours]"""
+    alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
+    descent: DescentConfig = field(default_factory=DescentConfig)
+    max_step: float = 0.3
+    """Metres from the guess; a hand at 30 Hz misses a constant-velocity guess by centimetres. [ours]"""
+    max_turn: float = 30.0
+    """Degrees from the guess. [ours]"""
+    min_overlap: float = 0.1
+    """Share of the rendered view that must fall into the live image. [ours]"""
+    min_agreement: float = 0.3
+    """Share of the overlap whose depth must agree with the map within the gate: a camera at a wrong place agrees by
+    chance on a few surfaces, a tracked one on most, even with something moving through the picture. [ours]"""
+
+    def __post_init__(self) -> None:
+        if self.solver not in ("alignment", "descent"):
+            raise ConfigError(f"tracker.solver is {self.solver!r}; choose alignment or descent")
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """Where the camera is, and how sure that is."""
+
+    T_map_cam: Pose
+    """The solver's pose, or the guess where `lost`."""
+    lost: str = ""
+    """Why the solver's pose is not believed; empty if it is."""
+    iterations: int = 0
+    overlap: float = 1.0
+    agreement: float = 1.0
+
+    @property
+    def converged(self) -> bool:
+        """Whether the pose may be mapped with."""
+        return not self.lost
+
+
+def _agreement(rendering: Rendering, frame: Frame, gate: float) -> tuple[float, float]:
+    """Share of the covered pixels that have a reading, and share of those whose depth agrees within the gate."""
+    depth = rendering.depth
+    both = (depth > 0) & (frame.depth > 0) & frame.valid
+    agreeing = both & ((depth - frame.depth).abs() < gate * (1 + 0.5 * frame.depth))
+    covered = float((depth > 0).sum())
+    return float(both.sum()) / max(covered, 1.0), float(agreeing.sum()) / max(float(both.sum()), 1.0)
+
+
+class Tracker:
+    """Finds a frame's pose in the active submap (Eqs. 17 to 19)."""
+
+    def __init__(self, config: TrackerConfig, confidence: ConfidenceConfig, rasterizer: Rasterizer) -> None:
+        self._config = config
+        self._floor = confidence.tracking_floor if confidence.guide_tracking else None
+        self._rasterizer = rasterizer
+
+    def track(self, frame: Frame, submap: Submap, guess: Pose) -> Tracked:
+        """Pose of `frame` in `submap`, starting from `guess` (`T_map_cam`); an empty submap returns the guess."""
+        if len(submap) == 0:
+            return Tracked(guess)
+        if self._config.solver == "descent":
+            found = descend(frame, submap, guess, self._rasterizer, self._config.descent, floor=self._floor)
+            overlap, agreement = _agreement(found.rendering, frame, self._config.alignment.gate)
+            return self._believed(guess, found.T_map_cam, found.iterations, overlap, agreement)
+        rendering = render_view(submap, frame.camera, guess, self._rasterizer)
+        if self._floor is None:
+            weight = torch.ones_like(rendering.confidence)
+        else:
+            weight = eq.tracking_weight(rendering.confidence, floor=self._floor)
+        aligned = align(frame, rendering, weight, guess, self._config.alignment)
+        return self._believed(guess, aligned.T_map_cam, aligned.iterations, aligned.overlap, aligned.agreement)
+
+    def _believed(self, guess: Pose, T_map_cam: Pose, iterations: int, overlap: float, agreement: float) -> Tracked:
+        """The solver's answer, or the guess and the reason why not."""
+        config = self._config
+        reason = ""
+        if not bool(torch.isfinite(T_map_cam).all()):
+            reason = "the solver diverged"
+        else:
+            moved = se3.inverse(guess) @ T_map_cam
+            step, turn = se3.translation_norm(moved), math.degrees(se3.rotation_angle(moved))
+            if step > config.max_step or turn > config.max_turn:
+                reason = f"a step of {100 * step:.0f} cm and {turn:.0f} degrees from the predicted pose"
+            elif overlap < config.min_overlap:
+                reason = f"only {100 * overlap:.0f} % of the mapped view is in the picture"
+            elif agreement < config.min_agreement:
+                reason = f"only {100 * agreement:.0f} % of the depth agrees with the map"
+        if reason:
+            return Tracked(guess, reason, iterations, overlap, agreement)
+        return Tracked(se3.orthonormalized(T_map_cam), "", iterations, overlap, agreement)
