@@ -79,7 +79,7 @@ def read_gaussians(path: Path) -> tuple[Gaussians, PerGaussian | None]:
         dc = columns(*_numbered("f_dc", 3))[:, None]
         rest = dc[:, 1:]
         if rest_count:
-            rest = columns(*_numbered("f_rest", rest_count)).unflatten(1, (3, rest_count // 3)).transpose(1, 2)
+            rest = columns(*_numbered("f_rest", rest_count)).reshape(count, 3, rest_count // 3).transpose(1, 2)
         gaussians = Gaussians(
             ids=torch.arange(count),
             means=columns("x", "y", "z"),

@@ -1,0 +1,235 @@
+"""A run's figures, each with its unit, and what exactly was evaluated to get them."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from tcgsplat.datasets.association import MAX_GAP, nearest
+from tcgsplat.datasets.sequence import Sequence
+from tcgsplat.errors import EvaluationError
+from tcgsplat.evaluation import ate, images
+from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.render.view import Rendering, render_view
+from tcgsplat.scene.atlas import Atlas
+from tcgsplat.scene.frame import Frame
+from tcgsplat.scene.trajectory import Trajectory, parse_tum
+from tcgsplat.storage import atomic
+from tcgsplat.storage.run_directory import RunDirectory
+from tcgsplat.tensors import Pose
+
+Times = Float[np.ndarray, " n"]
+"""Time stamps, seconds."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A number with its unit; the unit of a count or a ratio is empty."""
+
+    value: int | float
+    unit: str = ""
+
+    def __str__(self) -> str:
+        """Four significant digits of a measure, all of a count."""
+        if isinstance(self.value, int) or self.value == 0:
+            return f"{self.value} {self.unit}".rstrip()
+        decimals = max(0, 3 - math.floor(math.log10(abs(self.value))))
+        return f"{self.value:.{decimals}f} {self.unit}".rstrip()
+
+
+@dataclass(frozen=True)
+class Report:
+    """Metrics by name, and a description of what they were measured on."""
+
+    metrics: Mapping[str, Metric]
+    evaluated: Mapping[str, str] = field(default_factory=dict)
+    """Which frames, poses and pixels."""
+    missing: Mapping[str, str] = field(default_factory=dict)
+    """Why a metric is not there, by its name."""
+
+    def to_json(self) -> str:
+        """An object from metric name to `{"value", "unit"}`; `evaluated` has the rest, `missing` among it."""
+        rows = {name: {"value": metric.value, "unit": metric.unit} for name, metric in self.metrics.items()}
+        evaluated = {**self.evaluated, "missing": dict(self.missing)}
+        return json.dumps({**rows, "evaluated": evaluated}, indent=2, allow_nan=False) + "\n"
+
+    def table(self) -> str:
+        """For a terminal: a metric a line, then those that are missing, then what was evaluated."""
+        rows = {name: str(metric) for name, metric in self.metrics.items()}
+        rows |= {name: f"- ({reason})" for name, reason in self.missing.items()}
+        width = max(map(len, (*rows, *self.evaluated)), default=0)
+        groups = (rows, self.evaluated)
+        return "\n\n".join("\n".join(f"{name:<{width}}  {what}" for name, what in group.items()) for group in groups)
+
+    def write(self, path: Path) -> None:
+        """Put the JSON at `path`."""
+        atomic.write_text(path, self.to_json())
+
+
+def evaluate(run: RunDirectory, sequence: Sequence | None, rasterizer: Rasterizer, *, stride: int = 1) -> Report:
+    """Score a run, finished or not, by its own files and the ground truth of its sequence.
+
+    - `ate_rmse`, cm: camera centres of all tracked frames that have a true pose, after rigid alignment.
+    - `psnr` (dB), `ssim`, `depth_l1` (cm), `depth_coverage` (%): each keyframe drawn from its own submap as saved, at
+      its estimated pose, against its own image; means over the views. The map was optimised on these views.
+    - `frames`, `frames_lost`, `submaps`, `gaussians`, and from the run's summary `ms_per_frame` and `peak_rss_mb`.
+
+    Args:
+        run: The run's directory.
+        sequence: The data, read for ground truth only; None if it is not at hand.
+        rasterizer: Backend to draw with.
+        stride: Draw every so many-th keyframe.
+
+    Returns:
+        The report; a metric that cannot be had is absent, with the reason in `missing`.
+
+    Raises:
+        ArchiveError: if a file of the run is damaged.
+        DatasetError: if the ground truth is there but cannot be read.
+        EvaluationError: if the run has no sealed submap.
+    """
+    trajectory, atlas = run.trajectory()
+    if run.submap_count == 0 or len(trajectory) == 0:
+        raise EvaluationError(f"{run.path} has no sealed submap yet; let the run go on for longer, or run again")
+    truth = sequence.ground_truth() if sequence is not None else {}
+    scored = sum(row.frame_index in truth for row in trajectory.rows)
+    rows = {
+        "ate_rmse": _accuracy(trajectory, atlas, truth),
+        **_quality(run, rasterizer, stride),
+        "frames": Metric(len(trajectory)),
+        "frames_lost": Metric(sum(row.lost for row in trajectory.rows)),
+        **_cost(run.summary()),
+    }
+    return Report(
+        metrics={name: row for name, row in rows.items() if isinstance(row, Metric)},
+        evaluated={
+            "run": str(run.path),
+            "sequence": sequence.name if sequence is not None else run.sequence,
+            "trajectory": f"{scored} of {len(trajectory)} frames have a true pose; rigid alignment without scale",
+            "views": f"{'all keyframes' if stride == 1 else f'one keyframe in {stride}'} of the saved submaps, each "
+            "drawn from its own submap: training views",
+            "poses": "estimated",
+            "pixels": "psnr and ssim: valid pixels; depth_l1: those with a sensor reading, unmapped ones in full",
+        },
+        missing={name: row for name, row in rows.items() if isinstance(row, str)},
+    )
+
+
+def score_trajectory(estimated: Path, sequence: Sequence) -> Report:
+    """Score a trajectory of any system, given as text in the TUM format, against a sequence's ground truth.
+
+    A pose belongs to the frame whose time stamp is nearest, within 20 ms; of several, the nearest one. Decodes the
+    sequence once, for its time stamps.
+
+    Args:
+        estimated: File of `timestamp tx ty tz qx qy qz qw`, camera to world.
+        sequence: The data with its ground truth.
+
+    Returns:
+        `ate_rmse` and `ate_max` (cm, rigid alignment), and `frames`, those compared.
+
+    Raises:
+        EvaluationError: if the file cannot be read, there is no ground truth, or fewer than three poses match.
+    """
+    try:
+        stamps, poses = parse_tum(estimated.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise EvaluationError(f"cannot read {estimated} ({error}); give a trajectory in the TUM format") from error
+    truth = sequence.ground_truth()
+    if not truth:
+        raise EvaluationError(f"the sequence {sequence.name} has no ground truth to compare {estimated} with")
+    frames = [(frame.timestamp, truth[frame.index]) for frame in sequence if frame.index in truth]
+    pairs = associate(np.array(stamps), np.array([stamp for stamp, _ in frames]))
+    if len(pairs) < 3:
+        raise EvaluationError(
+            f"only {len(pairs)} of {len(poses)} poses in {estimated} are within {1000 * MAX_GAP:.0f} ms of a frame of "
+            f"{sequence.name} with a true pose; check that its time stamps are seconds of the same clock"
+        )
+    errors = ate.errors(ate.positions([poses[i] for i, _ in pairs]), ate.positions([frames[j][1] for _, j in pairs]))
+    return Report(
+        metrics={
+            "ate_rmse": Metric(100.0 * float(np.sqrt(np.square(errors).mean())), "cm"),
+            "ate_max": Metric(100.0 * float(errors.max()), "cm"),
+            "frames": Metric(len(pairs)),
+        },
+        evaluated={
+            "sequence": sequence.name,
+            "trajectory": f"{estimated}: {len(pairs)} of its {len(poses)} poses, against {len(frames)} frames with a "
+            "true pose; rigid alignment without scale",
+        },
+    )
+
+
+def associate(times: Times, others: Times, *, max_gap: float = MAX_GAP) -> list[tuple[int, int]]:
+    """Pairs (i, j) such that j is the other time nearest to time i, at most `max_gap` seconds away.
+
+    Each j is given once, to the nearest i; pairs come in the order of j. Neither list need be sorted.
+    """
+    if len(times) == 0 or len(others) == 0:
+        return []
+    order = np.argsort(others, kind="stable")
+    places, gaps = nearest(times, others[order])
+    best: dict[int, int] = {}
+    for i in np.argsort(gaps, kind="stable")[: int((gaps <= max_gap).sum())].tolist():
+        best.setdefault(int(order[places[i]]), i)
+    return [(best[j], j) for j in sorted(best)]
+
+
+# Each of these gives a metric or, in words, why there is none.
+
+
+def _accuracy(trajectory: Trajectory, atlas: Atlas, truth: Mapping[int, Pose]) -> Metric | str:
+    estimated = {row.frame_index: T for row, T in zip(trajectory.rows, trajectory.world(atlas), strict=True)}
+    common = [index for index in estimated if index in truth]
+    if len(common) < 3:
+        return f"only {len(common)} frames have a true pose" if truth else "no ground truth"
+    rmse = ate.ate_rmse_of_poses([estimated[index] for index in common], [truth[index] for index in common])
+    return Metric(100.0 * rmse, "cm")
+
+
+def _quality(run: RunDirectory, rasterizer: Rasterizer, stride: int) -> dict[str, Metric | str]:
+    """Submaps are read one after the other, so that memory holds one of them."""
+    scores: list[dict[str, Metric]] = []
+    gaussians = seen = 0
+    for index in range(run.submap_count):
+        submap = run.load_submap(index)
+        gaussians += len(submap)
+        for keyframe in submap.keyframes:
+            if seen % stride == 0:
+                frame = keyframe.frame
+                scores.append(_score(render_view(submap, frame.camera, keyframe.T_map_cam, rasterizer), frame))
+            seen += 1
+    names = ("psnr", "ssim", "depth_l1", "depth_coverage")
+    means = {name: _mean([score[name] for score in scores]) for name in names}
+    return {**means, "submaps": Metric(run.submap_count), "gaussians": Metric(gaussians)}
+
+
+def _score(rendering: Rendering, frame: Frame) -> dict[str, Metric]:
+    color, depth = rendering.color.clamp(0.0, 1.0), rendering.depth
+    read = frame.valid & (frame.depth > 0)
+    return {
+        "psnr": Metric(images.psnr(color, frame.color, frame.valid), "dB"),
+        "ssim": Metric(images.ssim(color, frame.color, frame.valid)),
+        "depth_l1": Metric(100.0 * images.depth_l1(depth, frame.depth, read), "cm"),
+        "depth_coverage": Metric(100.0 * float((depth[read] > 0).to(depth.dtype).mean()), "%"),
+    }
+
+
+def _mean(views: list[Metric]) -> Metric | str:
+    finite = [view.value for view in views if math.isfinite(view.value)]
+    return Metric(sum(finite) / len(finite), views[0].unit) if finite else "no view has a pixel that counts"
+
+
+def _cost(summary: Mapping[str, object]) -> dict[str, Metric | str]:
+    frames, seconds, peak = (summary.get(name) for name in ("frames", "seconds", "peak_rss_mb"))
+    absent = "summary.json does not tell" if summary else "no summary.json: the run has not ended, or was killed"
+    rows: dict[str, Metric | str] = {"ms_per_frame": absent, "peak_rss_mb": absent}
+    if isinstance(frames, int) and isinstance(seconds, int | float) and frames > 0:
+        rows["ms_per_frame"] = Metric(1000.0 * seconds / frames, "ms")
+    if isinstance(peak, int | float):
+        rows["peak_rss_mb"] = Metric(peak, "MB")
+    return rows

@@ -1,0 +1,260 @@
+"""Reports of small run directories on disk, whose figures are known."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tcgsplat.confidence.state import ConfidenceState
+from tcgsplat.errors import EvaluationError
+from tcgsplat.evaluation import figures
+from tcgsplat.evaluation.report import Metric, Report, associate, evaluate, score_trajectory
+from tcgsplat.geometry import se3
+from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.backends import open_rasterizer
+from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.render.view import render_view
+from tcgsplat.scene.atlas import Atlas
+from tcgsplat.scene.frame import Frame
+from tcgsplat.scene.gaussians import Gaussians
+from tcgsplat.scene.submap import Keyframe, Submap
+from tcgsplat.scene.trajectory import TrackedPose, Trajectory, format_tum
+from tcgsplat.storage.run_directory import RunDirectory
+from tcgsplat.tensors import Pose
+
+CAMERA = Camera(fx=40.0, fy=40.0, cx=23.5, cy=15.5, width=48, height=32)
+OFFSET = 0.05
+"""Metres by which the sensor's depth is greater than the map's."""
+
+
+@pytest.fixture(scope="module")
+def rasterizer() -> Rasterizer:
+    return open_rasterizer("reference")
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Frames in memory, with or without ground truth."""
+
+    frames: tuple[Frame, ...]
+    truth: dict[int, Pose] = field(default_factory=dict)
+    name: str = "wall"
+    camera: Camera = CAMERA
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self.frames)
+
+    def frame(self, index: int) -> Frame:
+        return self.frames[index]
+
+    def ground_truth(self) -> dict[int, Pose]:
+        return self.truth
+
+
+def at(x: float, y: float = 0.0, z: float = 0.0) -> Pose:
+    T = se3.identity()
+    T[:3, 3] = torch.tensor([x, y, z], dtype=torch.float64)
+    return T
+
+
+def wall(index: int, T_world_map: Pose) -> Submap:
+    """A textured wall 2 m ahead of the first camera."""
+    y, x = torch.meshgrid(torch.arange(-1.2, 1.2, 0.12), torch.arange(-1.8, 1.8, 0.12), indexing="ij")
+    n = x.numel()
+    generator = torch.Generator().manual_seed(index)
+    return Submap(
+        index=index,
+        T_world_map=T_world_map,
+        gaussians=Gaussians(
+            ids=torch.arange(n) + 1000 * index,
+            means=torch.stack((x.flatten(), y.flatten(), torch.full((n,), 2.0)), dim=1),
+            log_scales=torch.log(torch.tensor([0.08, 0.08, 0.01])).repeat(n, 1),
+            quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1),
+            logit_opacities=torch.full((n,), 3.0),
+            sh=torch.randn(n, 1, 3, generator=generator),
+        ),
+        confidence=ConfidenceState(
+            value=torch.rand(n, generator=generator),
+            baseline=torch.zeros(n),
+            born=torch.zeros(n, dtype=torch.int64),
+            updates=torch.ones(n, dtype=torch.int64),
+        ),
+        clock=1,
+    )
+
+
+def seen(submap: Submap, index: int, T_map_cam: Pose, rasterizer: Rasterizer) -> Keyframe:
+    """A keyframe whose image is the map's own picture, and whose depth is `OFFSET` farther, with a hole."""
+    rendering = render_view(submap, CAMERA, T_map_cam, rasterizer)
+    depth = rendering.depth + OFFSET
+    depth[:4, :4] = 0.0
+    valid = torch.ones(CAMERA.height, CAMERA.width, dtype=torch.bool)
+    valid[-3:] = False
+    color = rendering.color.clamp(0, 1).clone()
+    color[-3:] = 0.0
+    return Keyframe(Frame(index, 100.0 + index / 30, color, depth, valid, CAMERA), T_map_cam)
+
+
+@pytest.fixture
+def run(tmp_path: Path, rasterizer: Rasterizer) -> RunDirectory:
+    """Two submaps, eight frames at 10 cm steps, keyframes 0, 2, 4 and 6; frame 7 is lost and 4 cm off."""
+    run = RunDirectory.create(tmp_path / "run", config_toml="", sequence="/data/wall")
+    atlas = Atlas((at(0.0), at(0.4)))
+    rows = []
+    for index, T_world_map in enumerate(atlas.T_world_map):
+        submap = wall(index, T_world_map)
+        for i in range(4):
+            T_map_cam = at(0.1 * i, 0.04 if index == 1 and i == 3 else 0.0)
+            frame_index = 4 * index + i
+            rows.append(TrackedPose(frame_index, 100.0 + frame_index / 30, index, T_map_cam, lost=frame_index == 7))
+            if i % 2 == 0:
+                submap = submap.with_keyframe(seen(submap, frame_index, T_map_cam, rasterizer))
+        run.write_submap(submap)
+    run.write_trajectory(Trajectory(tuple(rows)), atlas)
+    run.write_summary({"frames": 8, "seconds": 2.0, "peak_rss_mb": 512.5, "stage_ms": {"track": 1.0}})
+    return run
+
+
+@pytest.fixture
+def sequence(run: RunDirectory) -> Recorded:
+    """The truth is the estimate without its error, in another world frame; frame 3 has none."""
+    frames = tuple(
+        Frame(i, 100.0 + i / 30, torch.zeros(4, 4, 3), torch.zeros(4, 4), torch.ones(4, 4, dtype=torch.bool), CAMERA)
+        for i in range(8)
+    )
+    T_other_world = se3.exp(torch.tensor([1.0, 2.0, 3.0, 0.3, -0.2, 0.9], dtype=torch.float64))
+    return Recorded(frames, {i: T_other_world @ at(0.1 * i) for i in range(8) if i != 3})
+
+
+def expected_ate_cm() -> float:
+    """By the same least squares, written out for this path in a plane: seven points, one of them 4 cm off."""
+    x = 0.1 * np.array([0, 1, 2, 4, 5, 6, 7])
+    true, estimated = x + 0j, x + 0.04j * (np.arange(7) == 6)
+    true, estimated = true - true.mean(), estimated - estimated.mean()
+    turn = np.vdot(estimated, true)
+    return float(100 * np.sqrt(np.mean(np.abs(estimated * turn / abs(turn) - true) ** 2)))
+
+
+def test_figures_of_a_run(run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer) -> None:
+    report = evaluate(run, sequence, rasterizer)
+    value = {name: metric.value for name, metric in report.metrics.items()}
+    unit = {name: metric.unit for name, metric in report.metrics.items()}
+    assert value["ate_rmse"] == pytest.approx(expected_ate_cm(), abs=1e-6)
+    assert 0.5 < value["ate_rmse"] < 4.0
+    assert value["psnr"] > 50.0  # all that parts them is rounding to 8 bits
+    assert value["ssim"] > 0.999
+    assert value["depth_l1"] == pytest.approx(100 * OFFSET, abs=0.02)
+    assert value["depth_coverage"] == pytest.approx(100.0)
+    assert (value["frames"], value["frames_lost"], value["submaps"]) == (8, 1, 2)
+    assert value["gaussians"] == 2 * len(wall(0, at(0.0)))
+    assert (value["ms_per_frame"], value["peak_rss_mb"]) == (250.0, 512.5)
+    assert report.missing == {}
+    assert unit == {
+        "ate_rmse": "cm", "psnr": "dB", "ssim": "", "depth_l1": "cm", "depth_coverage": "%", "frames": "",
+        "frames_lost": "", "submaps": "", "gaussians": "", "ms_per_frame": "ms", "peak_rss_mb": "MB",
+    }  # fmt: skip
+    assert report.evaluated["poses"] == "estimated"
+    assert "training views" in report.evaluated["views"]
+    assert report.evaluated["trajectory"].startswith("7 of 8 frames")
+
+
+def test_unmapped_pixels_count_in_full(run: RunDirectory, rasterizer: Rasterizer) -> None:
+    submap = run.load_submap(0)
+    half = submap.kept(submap.gaussians.means[:, 0] < 0.0)
+    run.write_submap(half)
+    report = evaluate(run, None, rasterizer)
+    assert 60.0 < report.metrics["depth_coverage"].value < 90.0
+    assert report.metrics["depth_l1"].value > 30.0
+
+
+def test_killed_run_without_data_is_still_scored(run: RunDirectory, rasterizer: Rasterizer) -> None:
+    (run.path / "summary.json").unlink()
+    (run.path / "submaps" / "0001.npz").unlink()
+    report = evaluate(run, None, rasterizer, stride=2)
+    assert report.metrics["submaps"].value == 1
+    assert report.metrics["psnr"].value > 50.0
+    assert report.missing.keys() == {"ate_rmse", "ms_per_frame", "peak_rss_mb"}
+    assert report.missing["ate_rmse"] == "no ground truth"
+    assert "was killed" in report.missing["ms_per_frame"]
+    assert "one keyframe in 2" in report.evaluated["views"]
+    assert "/data/wall" in report.evaluated["sequence"]
+
+
+def test_run_that_sealed_nothing(tmp_path: Path, rasterizer: Rasterizer) -> None:
+    run = RunDirectory.create(tmp_path / "new", config_toml="", sequence="")
+    with pytest.raises(EvaluationError, match="has no sealed submap yet"):
+        evaluate(run, None, rasterizer)
+    with pytest.raises(EvaluationError, match="has no sealed submap yet"):
+        figures.contact_sheet_of(run, rasterizer)
+    with pytest.raises(EvaluationError, match="has no trajectory yet"):
+        figures.trajectory_plot_of(run, None)
+
+
+def test_report_on_disk_and_on_a_terminal(tmp_path: Path) -> None:
+    report = Report(
+        {"ate_rmse": Metric(1.23456, "cm"), "frames": Metric(12345), "ms_per_frame": Metric(1234.56, "ms")},
+        {"poses": "estimated"},
+        {"psnr": "no view has a pixel that counts"},
+    )
+    report.write(tmp_path / "report.json")
+    assert json.loads((tmp_path / "report.json").read_text()) == {
+        "ate_rmse": {"value": 1.23456, "unit": "cm"},
+        "frames": {"value": 12345, "unit": ""},
+        "ms_per_frame": {"value": 1234.56, "unit": "ms"},
+        "evaluated": {"poses": "estimated", "missing": {"psnr": "no view has a pixel that counts"}},
+    }
+    assert report.table().splitlines() == [
+        "ate_rmse      1.235 cm",
+        "frames        12345",
+        "ms_per_frame  1235 ms",
+        "psnr          - (no view has a pixel that counts)",
+        "",
+        "poses         estimated",
+    ]
+
+
+def test_pictures_of_a_run(run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer) -> None:
+    sheet = figures.contact_sheet_of(run, rasterizer, columns=3, width=800)
+    assert sheet.shape[1] == 800
+    assert figures.contact_sheet_of(run, rasterizer, columns=9, width=800).shape[0] < sheet.shape[0]  # four keyframes
+    assert figures.trajectory_plot_of(run, sequence).shape[1] == 1200
+    assert figures.trajectory_plot_of(run, None).shape[1] == 1200
+
+
+def test_association_is_by_time_and_one_to_one() -> None:
+    times = np.array([0.0, 0.100, 0.104, 0.2, 0.5])
+    others = np.array([0.215, 0.103, 0.0, 0.9])
+    assert associate(times, others) == [(3, 0), (2, 1), (0, 2)]
+    assert associate(times, others, max_gap=0.01) == [(2, 1), (0, 2)]
+    assert associate(np.zeros(0), others) == associate(times, np.zeros(0)) == []
+
+
+def test_trajectory_of_another_system(tmp_path: Path, sequence: Recorded) -> None:
+    stamps = [100.0 + i / 30 + 0.004 for i in range(8)]
+    poses = [at(0.1 * i, 0.04 if i == 7 else 0.0) for i in range(8)]
+    (tmp_path / "other.txt").write_text(format_tum(stamps, poses))
+    report = score_trajectory(tmp_path / "other.txt", sequence)
+    assert report.metrics["ate_rmse"].value == pytest.approx(expected_ate_cm(), abs=1e-6)
+    assert report.metrics["frames"].value == 7
+    assert "7 of its 8 poses, against 7 frames" in report.evaluated["trajectory"]
+
+
+def test_trajectory_that_cannot_be_scored(tmp_path: Path, sequence: Recorded) -> None:
+    path = tmp_path / "other.txt"
+    with pytest.raises(EvaluationError, match=r"cannot read .*other\.txt"):
+        score_trajectory(path, sequence)
+    path.write_text("1 2 3\n")
+    with pytest.raises(EvaluationError, match="line 1 is not"):
+        score_trajectory(path, sequence)
+    path.write_text(format_tum([0.0, 1.0, 2.0], [at(0.0)] * 3))
+    with pytest.raises(EvaluationError, match=r"only 0 of 3 poses .* same clock"):
+        score_trajectory(path, sequence)
+    with pytest.raises(EvaluationError, match="wall has no ground truth"):
+        score_trajectory(path, Recorded(sequence.frames))
