@@ -6,8 +6,9 @@ from torch import Tensor
 
 
 def normalize(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """Scale quaternions (wxyz) to unit length; a zero quaternion becomes the identity's neighbour, never NaN."""
-    return quats / quats.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+    """Scale quaternions (wxyz) to unit length; one shorter than 1e-12 stays short, and zero stays zero, never NaN."""
+    length: Tensor = quats.norm(dim=-1, keepdim=True)
+    return quats / length.clamp_min(1e-12)
 
 
 def multiply(a: Float[Tensor, "*batch 4"], b: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
@@ -26,7 +27,10 @@ def multiply(a: Float[Tensor, "*batch 4"], b: Float[Tensor, "*batch 4"]) -> Floa
 
 
 def to_matrix(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of quaternions (wxyz) of any length: the length cancels, so raw parameters may be given."""
+    """Rotation matrices of quaternions (wxyz) of any length: the length cancels, so raw parameters may be given.
+
+    The zero quaternion gives the identity.
+    """
     w, x, y, z = normalize(quats).unbind(-1)
     return torch.stack(
         (
@@ -35,7 +39,7 @@ def to_matrix(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
             2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
         ),
         dim=-1,
-    ).unflatten(-1, (3, 3))  # fmt: skip
+    ).reshape(*quats.shape[:-1], 3, 3)  # fmt: skip
 
 
 def from_matrix(rotations: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:

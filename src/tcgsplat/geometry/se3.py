@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tcgsplat.geometry import quaternion
 from tcgsplat.tensors import Pose
 
 
@@ -21,49 +22,33 @@ def skew(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The matrix whose product with `x` is the cross product `v` x `x`."""
     x, y, z = v.unbind(-1)
     o = torch.zeros_like(x)
-    return torch.stack((o, -z, y, z, o, -x, -y, x, o), dim=-1).unflatten(-1, (3, 3))
-
-
-def _coefficients(angle: float) -> tuple[float, float, float]:
-    """sin(t)/t, (1-cos t)/t^2, (t-sin t)/t^3; by series near zero, where the closed forms lose all digits."""
-    if angle < 1e-4:
-        t2 = angle * angle
-        return 1 - t2 / 6, 0.5 - t2 / 24, 1 / 6 - t2 / 120
-    return math.sin(angle) / angle, (1 - math.cos(angle)) / angle**2, (angle - math.sin(angle)) / angle**3
+    return torch.stack((o, -z, y, z, o, -x, -y, x, o), dim=-1).reshape(*v.shape, 3)
 
 
 def exp(tangent: Float[Tensor, "6"]) -> Pose:
-    """Transform reached by following `[rho, omega]` for unit time."""
-    tangent = tangent.to(torch.float64)
-    w = skew(tangent[3:])
-    a, b, c = _coefficients(float(tangent[3:].norm()))
-    eye, ww = torch.eye(3, dtype=torch.float64), w @ w
-    T = identity()
-    T[:3, :3] = eye + a * w + b * ww
-    T[:3, 3] = (eye + b * w + c * ww) @ tangent[:3]
-    return T
+    """Transform reached by following `[rho, omega]` for unit time; differentiable everywhere."""
+    rho, omega = tangent.to(torch.float64).tensor_split([3])
+    angle: Tensor = omega.norm()
+    W = skew(omega)
+    axis = W / angle.clamp_min(1e-300)
+    a = torch.sinc(angle / math.pi)  # sin(angle) / angle
+    b = 0.5 * torch.sinc(angle / (2 * math.pi)).square()  # (1 - cos(angle)) / angle^2, by the half angle
+    eye = torch.eye(3, dtype=W.dtype, device=W.device)
+    return from_rotation_translation(eye + a * W + b * (W @ W), (eye + b * W + (1 - a) * (axis @ axis)) @ rho)
 
 
 def log(T: Pose) -> Float[Tensor, "6"]:
-    """Tangent `[rho, omega]` with `exp(log(T)) == T`; the rotation angle is in [0, pi]."""
-    T = T.to(torch.float64)
-    R = T[:3, :3]
-    vee = 0.5 * torch.stack((R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]))  # sin(angle) * axis
-    sine, cosine = float(vee.norm()), 0.5 * (float(R.trace()) - 1)
-    angle = math.atan2(sine, cosine)
-    if sine > 1e-7:
-        omega = vee * (angle / sine)
-    elif cosine > 0:
-        omega = vee  # angle / sin(angle) -> 1
-    else:  # half a turn: the antisymmetric part vanishes, the axis is the eigenvector of R + I
-        column = int(R.diagonal().argmax())
-        axis = (R + torch.eye(3, dtype=torch.float64))[:, column]
-        omega = angle * axis / axis.norm()
-    a, b, _ = _coefficients(angle)
-    # The last term of the inverse left Jacobian; its closed form is 0/0 at zero, where the limit is 1/12.
-    e = 1 / 12 if angle < 1e-3 else (1 - 0.5 * a / b) / angle**2
-    w = skew(omega)
-    V_inverse = torch.eye(3, dtype=torch.float64) - 0.5 * w + e * (w @ w)
+    """Tangent `[rho, omega]` with `exp(log(T)) == T`; the rotation angle is in [0, pi]. Not differentiable."""
+    T = T.detach().to(torch.float64)
+    # By way of the quaternion (cos, sin * axis) of half the angle, the axis is well defined up to half a turn.
+    w, xyz = quaternion.from_matrix(T[:3, :3]).tensor_split([1])
+    sine = float(xyz.norm())
+    half = math.atan2(sine, float(w))
+    omega = xyz * (2.0 * half / sine if sine > 0 else 2.0)
+    # The last coefficient of the inverse left Jacobian is 0/0 at no rotation, where its limit is 1/12.
+    e = 1 / 12 if half < 1e-4 else (1 - half / math.tan(half)) / (2.0 * half) ** 2
+    W = skew(omega)
+    V_inverse = torch.eye(3, dtype=torch.float64) - 0.5 * W + e * (W @ W)
     return torch.cat((V_inverse @ T[:3, 3], omega))
 
 

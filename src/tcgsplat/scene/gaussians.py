@@ -4,6 +4,7 @@ Every per-Gaussian tensor here and in `ConfidenceState` is a row table; rows are
 through `Submap.grown` and `Submap.kept`.
 """
 
+import math
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -85,7 +86,7 @@ class Gaussians:
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
-        return round(self.sh.shape[1] ** 0.5) - 1
+        return math.isqrt(self.sh.shape[1]) - 1
 
     @property
     def scales(self) -> Float[Tensor, "n 3"]:

@@ -46,13 +46,13 @@ def format_tum(
 ) -> str:
     """Trajectory as text in the TUM format: `timestamp tx ty tz qx qy qz qw`, metres, camera to world.
 
-    Seventeen digits, so that reading it back gives the same numbers.
+    Enough digits that reading it back gives the same numbers.
     """
     lines = ["# timestamp tx ty tz qx qy qz qw"]
     for stamp, T in zip(timestamps, T_world_cam, strict=True):
         w, x, y, z = quaternion.from_matrix(T[:3, :3]).tolist()
         tx, ty, tz = T[:3, 3].tolist()
-        lines.append(f"{stamp:.6f} " + " ".join(f"{value:.17g}" for value in (tx, ty, tz, x, y, z, w)))
+        lines.append(f"{float(stamp)!r} " + " ".join(f"{value:.17g}" for value in (tx, ty, tz, x, y, z, w)))
     return "\n".join(lines) + "\n"
 
 
@@ -69,7 +69,7 @@ def parse_tum(text: str) -> tuple[list[float], list[Pose]]:
         if not words or words[0].startswith("#"):
             continue
         try:
-            stamp, tx, ty, tz, qx, qy, qz, qw = (float(word) for word in words[:8])
+            stamp, tx, ty, tz, qx, qy, qz, qw = (float(word) for word in words)
         except ValueError as error:
             raise ValueError(f"line {number} is not 'timestamp tx ty tz qx qy qz qw': {line.strip()!r}") from error
         T = torch.eye(4, dtype=torch.float64)
