@@ -21,6 +21,7 @@ confidence = st.floats(P_MIN, 1)
 length = st.floats(0, 1)
 coordinate = st.floats(-10, 10)
 updates = st.integers(0, 200)
+duration = st.floats(0, 200)
 time = st.floats(0.5, 500)
 repeatable = settings(deadline=None, derandomize=True)
 
@@ -40,8 +41,8 @@ quats = vectors(4).filter(lambda q: q.norm() > 1e-3)
 
 
 @repeatable
-@given(p=confidence, n=updates, m=updates, tau=time)
-def test_eq4_decaying_twice_is_decaying_longer(p: float, n: int, m: int, tau: float) -> None:
+@given(p=confidence, n=duration, m=duration, tau=time)
+def test_eq4_decaying_twice_is_decaying_longer(p: float, n: float, m: float, tau: float) -> None:
     stepwise = eq.decay(
         eq.decay(row(p), decay_time=tau, p_min=P_MIN, elapsed=n), decay_time=tau, p_min=P_MIN, elapsed=m
     )
@@ -58,8 +59,8 @@ def test_eq16_is_the_decay_that_was_missed(p: float, b: int, tau: float) -> None
 
 
 @repeatable
-@given(p=confidence, elapsed=updates, tau=time)
-def test_eq4_never_passes_the_floor_and_never_rises(p: float, elapsed: int, tau: float) -> None:
+@given(p=confidence, elapsed=duration, tau=time)
+def test_eq4_never_passes_the_floor_and_never_rises(p: float, elapsed: float, tau: float) -> None:
     assert P_MIN <= eq.decay(row(p), decay_time=tau, p_min=P_MIN, elapsed=elapsed).item() <= p
 
 
