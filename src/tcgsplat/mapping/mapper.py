@@ -8,6 +8,7 @@ from tcgsplat.confidence import equations as eq
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
+from tcgsplat.mapping.keyframes import thinned
 from tcgsplat.mapping.optimizer import LearningRates, RowAdam
 from tcgsplat.mapping.seeding import IdSource, SeedingConfig, seed
 from tcgsplat.render.losses import color_error, depth_error, isotropy_error, ssim_map
@@ -45,6 +46,9 @@ class MapperConfig:
     """Gaussians that become fainter are dropped. [base: Replica] (base: 0.5 on TUM and ScanNet)"""
     frozen_color_share: float = 0.0
     """Share of the steps, from the first one, that leave colour alone. [ours] (base: 0.5)"""
+    max_keyframes: int = 40
+    """Keyframes that a submap keeps; redundant ones go first; 0 for all. Bounds memory and the share of old views
+    while the camera stays within one submap. [ours] (base: all)"""
     sh_degree: int = 0
     """Degree of the colour's spherical harmonics, 0 to 3. [base]"""
 
@@ -94,7 +98,8 @@ class Mapper:
         first = not submap.keyframes
         rendering = None if first else render_view(submap, frame.camera, T_map_cam, self._rasterizer)
         seeds = seed(frame, T_map_cam, rendering, submap.gaussians, self._ids, self._generator, config.seeding)
-        grown = submap.grown(seeds, self._confidence).with_keyframe(Keyframe(frame, T_map_cam))
+        keyframes = thinned((*submap.keyframes, Keyframe(frame, T_map_cam)), config.max_keyframes)
+        grown = replace(submap.grown(seeds, self._confidence), keyframes=keyframes)
 
         iterations = config.first_iterations if first else config.iterations
         optimized, loss = self._optimized(grown, iterations)

@@ -58,10 +58,6 @@ class Submap:
         """With only the flagged Gaussians and their confidence."""
         return replace(self, gaussians=self.gaussians.kept(keep), confidence=self.confidence.kept(keep))
 
-    def with_keyframe(self, keyframe: Keyframe) -> "Submap":
-        """With one more keyframe."""
-        return replace(self, keyframes=(*self.keyframes, keyframe))
-
     def sealed(self, config: ConfidenceConfig) -> "Submap":
         """The finished submap: confidence calibrated for unequal ages (Eq. 16). Seal once, and keep unchanged."""
         return replace(self, confidence=self.confidence.sealed(config))
