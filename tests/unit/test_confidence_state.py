@@ -169,3 +169,12 @@ def test_rows_keep_their_types_through_everything() -> None:
 def test_an_empty_map_can_be_observed_and_sealed() -> None:
     state = ConfidenceState.empty().observed(seen([], [], []), CONFIG).sealed(CONFIG)
     assert len(state) == 0
+
+
+def test_lengths_follow_the_steps_of_an_update():
+    config = ConfidenceConfig()
+    quarter = config.for_updates_of(25)
+    for name in ("distance_ref", "stability_scale", "slack_min", "slack_max"):
+        assert getattr(quarter, name) == pytest.approx(0.5 * getattr(config, name))
+    assert quarter.decay_time == config.decay_time
+    assert config.for_updates_of(100) == config

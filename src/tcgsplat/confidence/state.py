@@ -21,8 +21,7 @@ class ConfidenceConfig:
     `slack_max`) live on the scale of the self-distance of a Gaussian at rest. That is a random walk of the optimiser,
     so it grows with the square root of the steps in an update and in proportion to the learning rates. Simulated with
     pure noise as gradient at the base system's rates, fresh Adam moments in every update (median, 90 %): 3.6 mm and
-    5.0 mm after 100 steps, 1.8 and 2.4 after 20, 1.3 and 1.7 after 10. For updates of k steps multiply the four
-    lengths by sqrt(k / 100).
+    5.0 mm after 100 steps, 1.8 and 2.4 after 20, 1.3 and 1.7 after 10. `for_updates_of` scales the four lengths.
     """
 
     p_min: float = 0.1
@@ -118,6 +117,15 @@ class ConfidenceConfig:
             self._require(high, low <= getattr(self, high) < math.inf, f"at least {name}_min ({low:g}) and finite")
         self._require("stability_reduction", self.stability_reduction in ("mean", "sum"), '"mean" or "sum"')
         self._require("step_scale_mode", self.step_scale_mode in ("step", "gradient"), '"step" or "gradient"')
+
+    def for_updates_of(self, steps: int) -> "ConfidenceConfig":
+        """The same model for mapping updates of `steps` Adam steps: its four lengths scaled by sqrt(steps / 100).
+
+        Call it on values that suit 100 steps, as the defaults do.
+        """
+        factor = math.sqrt(steps / 100)
+        lengths = ("distance_ref", "stability_scale", "slack_min", "slack_max")
+        return replace(self, **{name: factor * getattr(self, name) for name in lengths})
 
     def _require(self, name: str, holds: bool, allowed: str) -> None:
         if not holds:
