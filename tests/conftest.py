@@ -1,4 +1,4 @@
-"""What every test shares: the environment variables that torch and numba read at import, and a seeded generator."""
+"""What every test shares: environment, annotations checked at run time, a seeded generator, and a room to look at."""
 
 import os
 
@@ -6,9 +6,44 @@ os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import pytest
+import shapes
 import torch
+
+shapes.check_from_now_on()
+
+from analytic_room import Room  # after the line above, or what it imports would go unchecked
+
+from tcgsplat.confidence.state import ConfidenceConfig
+from tcgsplat.geometry import se3
+from tcgsplat.mapping.feedback import judged
+from tcgsplat.mapping.mapper import Mapper, MapperConfig
+from tcgsplat.mapping.seeding import IdSource, SeedingConfig
+from tcgsplat.render.backends import open_rasterizer
+from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.scene.submap import Submap
 
 
 @pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def room() -> Room:
+    return Room()
+
+
+@pytest.fixture(scope="session")
+def rasterizer() -> Rasterizer:
+    return open_rasterizer("numba")
+
+
+@pytest.fixture(scope="session")
+def corner(rasterizer: Rasterizer) -> Submap:
+    """The room, mapped and judged once from the origin: a disc for every pixel."""
+    seeding = SeedingConfig(recipe="surface", spacing=1, footprint=0.5, flatness=0.2, opacity=0.9, push_back=0.0)
+    config = MapperConfig(seeding=seeding, first_iterations=30, depth_mode="planar", min_opacity=0.1)
+    mapper = Mapper(config, ConfidenceConfig(), rasterizer, IdSource(), torch.Generator().manual_seed(0))
+    frame = Room().frame()
+    mapped = mapper.map(frame, se3.identity(), Submap.anchored(se3.identity(), index=0))
+    return judged(mapped, frame, ConfidenceConfig(), "planar")

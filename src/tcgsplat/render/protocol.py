@@ -7,7 +7,7 @@ Nothing is divided by alpha here.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -66,6 +66,7 @@ class Raster:
     hidden behind others is still visible in this sense."""
 
 
+@runtime_checkable
 class Rasterizer(Protocol):
     """A backend: values in, value out, differentiable in every tensor of `Splats` and in the pose."""
 
