@@ -15,13 +15,15 @@ MAX_GAP = 0.5
 
 @dataclass(frozen=True)
 class ConstantVelocity:
-    """Pose and velocity of the last tracked frame."""
+    """Pose and velocity after the last frame."""
 
     T_map_cam: Pose = field(default_factory=se3.identity)
     timestamp: float | None = None
     """Seconds; None before the first frame."""
     velocity: Float[Tensor, "6"] = field(default_factory=lambda: torch.zeros(6, dtype=torch.float64))
     """Tangent per second, in the camera's own frame, so that it survives a change of map."""
+    lost: bool = False
+    """The pose is a guess: the way from it to the next tracked pose is no motion."""
 
     def predict(self, timestamp: float) -> Pose:
         """Where the camera should be at `timestamp`, `T_map_cam`."""
@@ -32,7 +34,7 @@ class ConstantVelocity:
 
     def advanced(self, T_map_cam: Pose, timestamp: float) -> "ConstantVelocity":
         """After a frame that was tracked."""
-        if self.timestamp is None or timestamp <= self.timestamp:
+        if self.timestamp is None or timestamp <= self.timestamp or self.lost:
             return ConstantVelocity(T_map_cam, timestamp, self.velocity)
         step = se3.log(se3.inverse(self.T_map_cam) @ T_map_cam)
         return ConstantVelocity(T_map_cam, timestamp, step / (timestamp - self.timestamp))
@@ -42,7 +44,7 @@ class ConstantVelocity:
 
         A blind camera that drifts on at full speed leaves the room; one that slows down stays where it can be found.
         """
-        return ConstantVelocity(T_map_cam, timestamp, 0.5 * self.velocity)
+        return ConstantVelocity(T_map_cam, timestamp, 0.5 * self.velocity, lost=True)
 
     def rebased(self) -> "ConstantVelocity":
         """In a new map whose frame is this camera."""
