@@ -6,6 +6,7 @@ by the tracking weight of Eq. 18. One render a frame instead of one an iteration
 minimises the same weighted residual through the rasterizer, as the paper does.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +38,7 @@ class AlignmentConfig:
     gate: float = 0.05
     """Metres, times (1 + z/2): depth that disagrees by more is another surface; doubled at coarse levels. [ours]"""
     sigma_floor: float = 0.0017
-    """Depth noise at 0.4 m, metres: a structured-light sensor's (Nguyen et al. 2012) and a little for the map. [ours]"""
+    """Depth noise at 0.4 m, metres: a structured-light sensor's (Nguyen et al. 2012) and some for the map. [ours]"""
     sigma_slope: float = 0.0019
     """Growth of depth noise with the square of the distance beyond 0.4 m, 1/metre. [ours]"""
 
@@ -56,6 +57,8 @@ class Alignment:
     """Share of the rendered view that falls into the live image."""
     agreement: float
     """Share of that overlap whose depth agrees within the gate."""
+    correlation: float
+    """Of live and rendered intensity where the depth does not disagree, in [-1, 1]; does not feel the exposure."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,8 @@ class _Level:
     camera: Camera
 
 
-def _luma(color: torch.Tensor) -> Floats:
+def luma(color: torch.Tensor) -> Floats:
+    """Intensity of an RGB image [h, w], on the CPU."""
     weights = torch.tensor([0.299, 0.587, 0.114], dtype=color.dtype)
     return (color @ weights).numpy()  # type: ignore[no-any-return]
 
@@ -92,7 +96,7 @@ def _reference(rendering: Rendering, weight: Plane, camera: Camera, config: Alig
     """Points of each level of the rendered view, finest first."""
     alpha = rendering.alpha
     depth = torch.where(alpha > config.min_alpha, rendering.depth, 0.0).numpy()
-    intensity = _luma(rendering.color / alpha.clamp_min(1e-3)[..., None])
+    intensity = luma(rendering.color / alpha.clamp_min(1e-3)[..., None])
     points = []
     levels = _pyramid(intensity, depth, camera, len(config.iterations))
     weights = np.ascontiguousarray(weight.numpy())
@@ -128,12 +132,23 @@ class _Photometry:
             self.offset = live - self.gain * reference
 
 
+def correlation(weight: float, x: float, y: float, xx: float, xy: float, yy: float) -> float:
+    """Correlation of two intensities from sums of weights, values and products; NaN if one of them is.
+
+    A small prior, a common spread of 0.01, lets two flat images correlate and a flat one alone not.
+    """
+    total, prior = max(weight, 1.0), 1e-4
+    mean_x, mean_y = x / total, y / total
+    variance_x, variance_y = max(xx / total - mean_x**2, 0.0) + prior, max(yy / total - mean_y**2, 0.0) + prior
+    return (xy / total - mean_x * mean_y + prior) / math.sqrt(variance_x * variance_y)
+
+
 def _step(H: npt.NDArray[np.float64], g: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     full = np.zeros((6, 6))
     full[np.triu_indices(6)] = H
     full += np.triu(full, 1).T
     damping = 1e-6 * np.diag(np.maximum(np.diag(full), 1.0))
-    return -np.linalg.solve(full + damping, g)
+    return -np.asarray(np.linalg.solve(full + damping, g), np.float64)
 
 
 def align(frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, config: AlignmentConfig) -> Alignment:
@@ -148,7 +163,7 @@ def align(frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, co
     """
     points = _reference(rendering, weight, frame.camera, config)
     depth = torch.where(frame.valid, frame.depth, -1.0).numpy()
-    live = _pyramid(_luma(frame.color), depth, frame.camera, len(config.iterations))
+    live = _pyramid(luma(frame.color), depth, frame.camera, len(config.iterations))
 
     T = np.eye(4)  # reference camera to live camera
     photometry, stats, passes = _Photometry(), np.zeros(kernels.STATISTICS), 0
@@ -179,4 +194,8 @@ def align(frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, co
         depth_residual=photometry.depth_scale,
         overlap=seen / max(len(points[0]), 1),
         agreement=agreeing / max(seen, 1.0),
+        correlation=correlation(
+            *(float(stats[k]) for k in (kernels.GAIN_W, kernels.GAIN_R, kernels.GAIN_L)),
+            *(float(stats[k]) for k in (kernels.GAIN_RR, kernels.GAIN_RL, kernels.GAIN_LL)),
+        ),
     )

@@ -14,13 +14,15 @@ POINT = 8
 # Entries of the statistics that one pass leaves.
 (
     COLOR_SQUARES, COLOR_WEIGHT, DEPTH_SQUARES, DEPTH_WEIGHT,
-    GAIN_W, GAIN_R, GAIN_L, GAIN_RR, GAIN_RL, IN_VIEW, AGREEING,
-) = range(11)  # fmt: skip
-STATISTICS = 11
+    GAIN_W, GAIN_R, GAIN_L, GAIN_RR, GAIN_RL, GAIN_LL, IN_VIEW, AGREEING,
+) = range(12)  # fmt: skip
+STATISTICS = 12
 
 STUDENT_DOF = np.float32(5)
 """Student-t degrees of freedom: the weight (dof + 1) / (dof + (r/s)^2) of Kerl et al., ICRA 2013."""
 _HALF, _ONE, _QUARTER = np.float32(0.5), np.float32(1), np.float32(0.25)
+_NEAREST = np.float32(0.1)
+"""Points nearer to the live camera than this are left out, metres."""
 SMOOTH = np.float32(0.03)
 """Neighbouring depths that differ by less than this share lie on one surface."""
 
@@ -133,8 +135,8 @@ def _add(H, g, w, r, j):  # type: ignore[no-untyped-def]
 
 @njit(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True, cache=True)
 def normal_equations(
-    points, intensity, depth, focal, center, R, t, gain, offset, color_scale, depth_scale, gate, color_weight, depth_weight,
-    sigma_floor, sigma_slope,
+    points, intensity, depth, focal, center, R, t, gain, offset, color_scale, depth_scale, gate, color_weight,
+    depth_weight, sigma_floor, sigma_slope,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """One Gauss-Newton pass over the reference points: H (upper triangle, 21), g (6) and STATISTICS.
 
@@ -154,7 +156,7 @@ def normal_equations(
         X = R[0, 0] * p[PX] + R[0, 1] * p[PY] + R[0, 2] * p[PZ] + t[0]
         Y = R[1, 0] * p[PX] + R[1, 1] * p[PY] + R[1, 2] * p[PZ] + t[1]
         Z = R[2, 0] * p[PX] + R[2, 1] * p[PY] + R[2, 2] * p[PZ] + t[2]
-        if Z < np.float32(0.1):
+        if Z < _NEAREST:
             continue
         iz = _ONE / Z
         u, v = focal[0] * X * iz + center[0], focal[1] * Y * iz + center[1]
@@ -209,6 +211,7 @@ def normal_equations(
         stats[GAIN_L] += student * live
         stats[GAIN_RR] += student * reference * reference
         stats[GAIN_RL] += student * reference * live
+        stats[GAIN_LL] += student * live * live
         dX, dY = du * focal[0] * iz, dv * focal[1] * iz
         dZ = -(dX * X + dY * Y) * iz
         j[0], j[1], j[2] = dX, dY, dZ

@@ -71,11 +71,10 @@ class Descent:
     """What the solver found."""
 
     T_map_cam: Pose
+    """Where the loss was smallest."""
     iterations: int
     loss: float
     """The smallest value of Eq. 19 that was met."""
-    rendering: Rendering
-    """The map at the pose with that value."""
 
 
 def descend(
@@ -108,10 +107,10 @@ def descend(
         loss = weighted_residual(rendering, weight, frame, config)
         value = float(loss.detach())
         if best is None or value < best.loss:
-            best = Descent(se3.inverse(T_cam_map.detach()), iteration + 1, value, rendering)
+            best = Descent(se3.inverse(T_cam_map.detach()), iteration + 1, value)
         adam.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         adam.step()
     if best is None:
         raise ValueError("descent needs at least one iteration")
-    return Descent(best.T_map_cam, config.iterations, best.loss, best.rendering)
+    return Descent(best.T_map_cam, config.iterations, best.loss)

@@ -4,9 +4,10 @@ A failure is a result: the frame is reported lost, keeps the predicted pose, and
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
+import numpy as np
 import torch
 
 from tcgsplat.confidence import equations as eq
@@ -18,7 +19,7 @@ from tcgsplat.render.view import Rendering, render_view
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.alignment import AlignmentConfig, align
+from tcgsplat.tracking.alignment import AlignmentConfig, align, correlation, luma
 from tcgsplat.tracking.descent import DescentConfig, descend
 
 
@@ -39,6 +40,9 @@ class TrackerConfig:
     min_agreement: float = 0.3
     """Share of the overlap whose depth must agree with the map within the gate: a camera at a wrong place agrees by
     chance on a few surfaces, a tracked one on most, even with something moving through the picture. [ours]"""
+    min_correlation: float = 0.4
+    """Between the colours of the picture and of the map, whatever the exposure: a covered lens, a flash and noise
+    correlate with nothing, where the depth may still agree or be missing. Real frames: 0.92 and more. [ours]"""
 
     def __post_init__(self) -> None:
         if self.solver not in ("alignment", "descent"):
@@ -56,6 +60,7 @@ class Tracked:
     iterations: int = 0
     overlap: float = 1.0
     agreement: float = 1.0
+    correlation: float = 1.0
 
     @property
     def converged(self) -> bool:
@@ -63,13 +68,19 @@ class Tracked:
         return not self.lost
 
 
-def _agreement(rendering: Rendering, frame: Frame, gate: float) -> tuple[float, float]:
-    """Share of the covered pixels that have a reading, and share of those whose depth agrees within the gate."""
+def _compared(rendering: Rendering, frame: Frame, gate: float) -> tuple[float, float, float]:
+    """Share of the covered pixels that have a reading, share of those whose depth agrees, correlation of colours."""
     depth = rendering.depth
     both = (depth > 0) & (frame.depth > 0) & frame.valid
     agreeing = both & ((depth - frame.depth).abs() < gate * (1 + 0.5 * frame.depth))
     covered = float((depth > 0).sum())
-    return float(both.sum()) / max(covered, 1.0), float(agreeing.sum()) / max(float(both.sum()), 1.0)
+    pixels = ((depth > 0) & frame.valid).numpy()
+    x, y = luma(rendering.color)[pixels].astype(np.float64), luma(frame.color)[pixels].astype(np.float64)
+    return (
+        float(both.sum()) / max(covered, 1.0),
+        float(agreeing.sum()) / max(float(both.sum()), 1.0),
+        correlation(len(x), x.sum(), y.sum(), x @ x, x @ y, y @ y),
+    )
 
 
 class Tracker:
@@ -81,36 +92,44 @@ class Tracker:
         self._rasterizer = rasterizer
 
     def track(self, frame: Frame, submap: Submap, guess: Pose) -> Tracked:
-        """Pose of `frame` in `submap`, starting from `guess` (`T_map_cam`); an empty submap returns the guess."""
+        """Pose of `frame` in `submap`, starting from `guess` (`T_map_cam`).
+
+        In an empty submap the guess is the pose, unless there is no depth to begin a map with.
+        """
         if len(submap) == 0:
-            return Tracked(guess)
+            begins = bool((frame.valid & (frame.depth > 0)).any())
+            return Tracked(guess, "" if begins else "there is no map yet, and no depth to begin one with")
         if self._config.solver == "descent":
             found = descend(frame, submap, guess, self._rasterizer, self._config.descent, floor=self._floor)
-            overlap, agreement = _agreement(found.rendering, frame, self._config.alignment.gate)
-            return self._believed(guess, found.T_map_cam, found.iterations, overlap, agreement)
+            rendering = render_view(submap, frame.camera, found.T_map_cam, self._rasterizer)
+            compared = _compared(rendering, frame, self._config.alignment.gate)
+            return self._believed(guess, Tracked(found.T_map_cam, "", found.iterations, *compared))
         rendering = render_view(submap, frame.camera, guess, self._rasterizer)
         if self._floor is None:
             weight = torch.ones_like(rendering.confidence)
         else:
             weight = eq.tracking_weight(rendering.confidence, floor=self._floor)
         aligned = align(frame, rendering, weight, guess, self._config.alignment)
-        return self._believed(guess, aligned.T_map_cam, aligned.iterations, aligned.overlap, aligned.agreement)
+        compared = (aligned.overlap, aligned.agreement, aligned.correlation)
+        return self._believed(guess, Tracked(aligned.T_map_cam, "", aligned.iterations, *compared))
 
-    def _believed(self, guess: Pose, T_map_cam: Pose, iterations: int, overlap: float, agreement: float) -> Tracked:
+    def _believed(self, guess: Pose, found: Tracked) -> Tracked:
         """The solver's answer, or the guess and the reason why not."""
         config = self._config
         reason = ""
-        if not bool(torch.isfinite(T_map_cam).all()):
+        if not bool(torch.isfinite(found.T_map_cam).all()):
             reason = "the solver diverged"
         else:
-            moved = se3.inverse(guess) @ T_map_cam
+            moved = se3.inverse(guess) @ found.T_map_cam
             step, turn = se3.translation_norm(moved), math.degrees(se3.rotation_angle(moved))
             if step > config.max_step or turn > config.max_turn:
                 reason = f"a step of {100 * step:.0f} cm and {turn:.0f} degrees from the predicted pose"
-            elif overlap < config.min_overlap:
-                reason = f"only {100 * overlap:.0f} % of the mapped view is in the picture"
-            elif agreement < config.min_agreement:
-                reason = f"only {100 * agreement:.0f} % of the depth agrees with the map"
+            elif found.overlap < config.min_overlap:
+                reason = f"only {100 * found.overlap:.0f} % of the mapped view is in the picture"
+            elif found.agreement < config.min_agreement:
+                reason = f"only {100 * found.agreement:.0f} % of the depth agrees with the map"
+            elif not found.correlation >= config.min_correlation:  # NaN, too
+                reason = f"its colours correlate by only {found.correlation:.2f} with the map's"
         if reason:
-            return Tracked(guess, reason, iterations, overlap, agreement)
-        return Tracked(se3.orthonormalized(T_map_cam), "", iterations, overlap, agreement)
+            return replace(found, T_map_cam=guess, lost=reason)
+        return replace(found, T_map_cam=se3.orthonormalized(found.T_map_cam))

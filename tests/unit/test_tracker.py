@@ -1,0 +1,172 @@
+"""Tracking as a whole: a pose where there is one, and else a reason."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic_room import Room, errors, pose
+from torch import Tensor
+
+from tcgsplat.confidence.state import ConfidenceConfig
+from tcgsplat.errors import ConfigError
+from tcgsplat.geometry import se3
+from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.scene.frame import Frame
+from tcgsplat.scene.submap import Submap
+from tcgsplat.tracking.alignment import AlignmentConfig
+from tcgsplat.tracking.descent import DescentConfig
+from tcgsplat.tracking.tracker import Tracker, TrackerConfig
+
+T_TRUE = pose(0.01, -0.006, 0.012, degrees=(0.4, 0.6, -0.3))
+ALIGNMENT = TrackerConfig(
+    solver="alignment",
+    alignment=AlignmentConfig(iterations=(4, 3, 3), stride=2),
+    max_step=0.3,
+    max_turn=30.0,
+    min_overlap=0.1,
+    min_agreement=0.3,
+    min_correlation=0.4,
+)
+DESCENT = replace(
+    ALIGNMENT,
+    solver="descent",
+    descent=DescentConfig(iterations=30, rotation_rate=1e-3, translation_rate=2e-3, depth_mode="planar"),
+)
+
+
+def tracker(rasterizer: Rasterizer, config: TrackerConfig = ALIGNMENT, **confidence: object) -> Tracker:
+    return Tracker(config, ConfidenceConfig(**confidence), rasterizer)  # type: ignore[arg-type]
+
+
+def noise(like: Tensor) -> Tensor:
+    return torch.rand(like.shape, generator=torch.Generator().manual_seed(0))
+
+
+def with_a_bad_pixel(color: Tensor) -> Tensor:
+    color = color.clone()
+    color[30, 40] = math.nan
+    return color
+
+
+UNUSABLE: dict[str, tuple[Callable[[Frame], Frame], str]] = {
+    "black": (lambda f: replace(f, color=torch.zeros_like(f.color)), "correlate"),
+    "white": (lambda f: replace(f, color=torch.ones_like(f.color)), "correlate"),
+    "noise": (lambda f: replace(f, color=noise(f.color)), "correlate"),
+    "black without depth": (
+        lambda f: replace(f, color=torch.zeros_like(f.color), depth=torch.zeros_like(f.depth)),
+        "correlate",
+    ),
+    "depth of another place": (lambda f: replace(f, depth=f.depth + 0.7), "depth agrees"),
+    "another place": (lambda _: Room().frame(pose(degrees=(0, 90, 0))), ""),
+    "mirror place": (lambda _: Room().frame(pose(degrees=(0, 180, 0))), ""),
+    "colour is not a number": (lambda f: replace(f, color=f.color * math.nan), ""),
+    "one pixel is not a number": (lambda f: replace(f, color=with_a_bad_pixel(f.color)), ""),
+    "blind": (lambda f: replace(f, valid=torch.zeros_like(f.valid)), "in the picture"),
+}
+
+
+@pytest.mark.parametrize("config", [ALIGNMENT, DESCENT], ids=["alignment", "descent"])
+def test_a_frame_is_tracked_against_the_map(
+    config: TrackerConfig, room: Room, corner: Submap, rasterizer: Rasterizer
+) -> None:
+    tracked = tracker(rasterizer, config).track(room.frame(T_TRUE), corner, se3.identity())
+    assert tracked.converged and tracked.lost == ""
+    millimetres, degrees = errors(tracked.T_map_cam, T_TRUE)
+    assert millimetres < 4
+    assert degrees < 0.3
+    R = tracked.T_map_cam[:3, :3]
+    torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64), atol=1e-12, rtol=0)
+    assert tracked.overlap > 0.9 and tracked.agreement > 0.9 and tracked.correlation > 0.9
+
+
+@pytest.mark.parametrize("case", UNUSABLE)
+def test_an_unusable_frame_is_lost_for_a_reason_and_keeps_the_guess(
+    case: str, room: Room, corner: Submap, rasterizer: Rasterizer
+) -> None:
+    spoil, reason = UNUSABLE[case]
+    guess = T_TRUE @ pose(0.004, 0, 0)
+    tracked = tracker(rasterizer).track(spoil(room.frame(T_TRUE)), corner, guess)
+    assert not tracked.converged
+    assert reason in tracked.lost and tracked.lost
+    assert torch.equal(tracked.T_map_cam, guess)
+
+
+@pytest.mark.parametrize("case", ["black", "black without depth", "colour is not a number", "depth of another place"])
+def test_descent_loses_them_too(case: str, room: Room, corner: Submap, rasterizer: Rasterizer) -> None:
+    tracked = tracker(rasterizer, DESCENT).track(UNUSABLE[case][0](room.frame(T_TRUE)), corner, T_TRUE)
+    assert tracked.lost
+    assert torch.equal(tracked.T_map_cam, T_TRUE)
+
+
+def test_exposure_does_not_lose_a_frame(room: Room, corner: Submap, rasterizer: Rasterizer) -> None:
+    frame = room.frame(T_TRUE)
+    brighter = replace(frame, color=(1.3 * frame.color + 0.05).clamp(0, 1))
+    tracked = tracker(rasterizer).track(brighter, corner, se3.identity())
+    assert tracked.converged
+    assert errors(tracked.T_map_cam, T_TRUE)[0] < 6
+
+
+def test_flat_walls_are_no_reason_to_be_lost(rasterizer: Rasterizer, corner: Submap) -> None:
+    """A map without texture has nothing to correlate with; its depth is enough."""
+    gaussians = replace(corner.gaussians, sh=torch.zeros_like(corner.gaussians.sh))
+    grey = Room(contrast=0.0).frame(T_TRUE)
+    tracked = tracker(rasterizer).track(grey, replace(corner, gaussians=gaussians), se3.identity())
+    assert tracked.converged
+    assert errors(tracked.T_map_cam, T_TRUE)[0] < 4
+
+
+@pytest.mark.parametrize(
+    ("limits", "reason"),
+    [
+        ({"max_step": 1e-3}, "cm and"),
+        ({"max_turn": 1e-2}, "cm and"),
+        ({"min_overlap": 1.01}, "in the picture"),
+        ({"min_agreement": 1.01}, "of the depth agrees"),
+        ({"min_correlation": 1.01}, "correlate"),
+    ],
+)
+def test_every_limit_can_lose_a_frame(
+    limits: dict[str, float], reason: str, room: Room, corner: Submap, rasterizer: Rasterizer
+) -> None:
+    tracked = tracker(rasterizer, replace(ALIGNMENT, **limits)).track(room.frame(T_TRUE), corner, se3.identity())  # type: ignore[arg-type]
+    assert reason in tracked.lost
+    assert torch.equal(tracked.T_map_cam, se3.identity())
+
+
+def test_an_empty_submap_returns_the_guess(room: Room, rasterizer: Rasterizer) -> None:
+    tracked = tracker(rasterizer).track(room.frame(), Submap.anchored(se3.identity(), index=0), T_TRUE)
+    assert tracked.converged
+    assert torch.equal(tracked.T_map_cam, T_TRUE)
+
+
+def test_a_map_cannot_begin_without_depth(room: Room, rasterizer: Rasterizer) -> None:
+    frame = room.frame()
+    empty = Submap.anchored(se3.identity(), index=0)
+    for hopeless in (
+        replace(frame, depth=torch.zeros_like(frame.depth)),
+        replace(frame, valid=torch.zeros_like(frame.valid)),
+    ):
+        tracked = tracker(rasterizer).track(hopeless, empty, T_TRUE)
+        assert "no depth to begin one" in tracked.lost
+
+
+@pytest.mark.parametrize("config", [ALIGNMENT, replace(DESCENT, descent=replace(DESCENT.descent, iterations=5))])
+def test_confidence_moves_the_pose_only_where_it_guides_tracking(
+    config: TrackerConfig, room: Room, corner: Submap, rasterizer: Rasterizer
+) -> None:
+    frame = room.frame(T_TRUE)
+    half = torch.where(corner.gaussians.means[:, 0] < 0, 0.1, 1.0)
+    doubtful = replace(corner, confidence=replace(corner.confidence, value=half))
+
+    def found(submap: Submap, guide: bool) -> Tensor:
+        return tracker(rasterizer, config, guide_tracking=guide).track(frame, submap, se3.identity()).T_map_cam
+
+    assert torch.equal(found(corner, guide=False), found(doubtful, guide=False))
+    assert not torch.equal(found(corner, guide=True), found(doubtful, guide=True))
+
+
+def test_an_unknown_solver_is_refused_by_name() -> None:
+    with pytest.raises(ConfigError, match=r"tracker\.solver is 'icp'; choose alignment or descent"):
+        TrackerConfig(solver="icp")  # type: ignore[arg-type]
