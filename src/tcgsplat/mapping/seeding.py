@@ -17,6 +17,7 @@ from torch import Tensor
 
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import quaternion, se3
+from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.view import Rendering
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import SH_C0, Gaussians
@@ -31,13 +32,13 @@ class SeedingConfig:
     """Discs on the surface [ours], or the base system's points [base]."""
     min_alpha: float = 0.6
     """Pixels covered less are unmapped. [base]"""
-    opacity: float = 0.9
-    """At birth. [ours] (base: 0.5)"""
+    opacity: float = 0.95
+    """At birth: a seed is a measured surface, not a guess. [ours] (base: 0.5)"""
     push_back: float = 0.0
     """Share of the depth by which seeds are set behind the measured point. [ours] (base: 0.005)"""
     spacing: int = 2
     """`surface`: one seed for every so many pixels: 1 all, 2 a checkerboard, 4 every second row and column. [ours]"""
-    footprint: float = 0.5
+    footprint: float = 0.6
     """`surface`: standard deviation at birth, in pixels, for a seed at every pixel's distance; grows with the root of
     `spacing / 2`. With the renderer's blur of 0.3 px^2 a checkerboard of them is closed and still sharp. [ours]"""
     flatness: float = 0.2
@@ -76,26 +77,26 @@ class IdSource:
         return ids
 
 
-def surface_normals(depth: Plane, frame: Frame) -> Float[Tensor, "h w 3"]:
+def surface_normals(depth: Plane, camera: Camera) -> Float[Tensor, "h w 3"]:
     """Unit normals of a depth image in the camera frame, towards the camera; the viewing ray's where unknown.
 
-    Depth is averaged over 5 x 5 readings first, where that average stays within 3 % of the reading: noise is an order
-    larger than the slope between two pixels.
+    Points are averaged over 5 x 5 readings first, where that moves them by less than 3 % of the depth: noise is an
+    order larger than the slope between two pixels. Points, not depths: where a window hangs over a border or a hole,
+    its average still lies on the plane of its points.
     """
-    readings = (depth > 0).float()
-    window = torch.ones(1, 1, 5, 5) / 25.0
-    sums = torch.nn.functional.conv2d(torch.stack((depth, readings))[:, None], window, padding=2)[:, 0]
-    mean = sums[0] / sums[1].clamp_min(1e-6)
-    smooth = torch.where((depth > 0) & ((mean - depth).abs() < 0.03 * depth), mean, depth)
-
-    rays = frame.camera.rays()
-    points = rays * smooth[..., None]
+    rays = camera.rays()
+    measured = rays * depth[..., None]
+    layers = torch.cat((measured, (depth > 0).float()[..., None]), dim=-1).permute(2, 0, 1)[:, None]
+    sums = torch.nn.functional.conv2d(layers, torch.ones(1, 1, 5, 5), padding=2)[:, 0]
+    mean = (sums[:3] / sums[3].clamp_min(1.0)).permute(1, 2, 0)
+    one_surface = (depth > 0) & ((mean[..., 2] - depth).abs() < 0.03 * depth)
+    points = torch.where(one_surface[..., None], mean, measured)
     du = points[1:-1, 2:] - points[1:-1, :-2]
     dv = points[2:, 1:-1] - points[:-2, 1:-1]
     inner = torch.nn.functional.normalize(torch.linalg.cross(dv, du), dim=-1)
     normals = torch.nn.functional.pad(inner.permute(2, 0, 1), (1, 1, 1, 1)).permute(1, 2, 0)
     facing = -(normals * torch.nn.functional.normalize(rays, dim=-1)).sum(dim=-1)
-    neighbors = torch.nn.functional.max_pool2d(-readings[None], 3, stride=1, padding=1)[0] < 0  # all nine have one
+    neighbors = torch.nn.functional.max_pool2d(-layers[3], 3, stride=1, padding=1)[0] < 0  # all nine have one
     known = neighbors & (facing > 0.15)
     return torch.where(known[..., None], normals, -torch.nn.functional.normalize(rays, dim=-1))
 
@@ -171,7 +172,7 @@ def _surface_seeds(
     chosen = mask & _lattice(*mask.shape, config.spacing)
     depth = frame.depth[chosen]
     points = (frame.camera.rays() * frame.depth[..., None])[chosen] * (1 + config.push_back)
-    normals = surface_normals(frame.depth, frame)[chosen]
+    normals = surface_normals(frame.depth, frame.camera)[chosen]
     rays = torch.nn.functional.normalize(points, dim=-1)
     facing = -(normals * rays).sum(dim=-1).clamp(-1.0, -0.0)  # cosine between normal and viewing direction, >= 0
 
