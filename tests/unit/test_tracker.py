@@ -27,7 +27,7 @@ ALIGNMENT = TrackerConfig(
     max_turn=30.0,
     min_overlap=0.1,
     min_agreement=0.3,
-    min_correlation=0.4,
+    min_correlation=0.6,
 )
 DESCENT = replace(
     ALIGNMENT,

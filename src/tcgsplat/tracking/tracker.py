@@ -40,7 +40,7 @@ class TrackerConfig:
     min_agreement: float = 0.3
     """Share of the overlap whose depth must agree with the map within the gate: a camera at a wrong place agrees by
     chance on a few surfaces, a tracked one on most, even with something moving through the picture. [ours]"""
-    min_correlation: float = 0.4
+    min_correlation: float = 0.6
     """Between the colours of the picture and of the map, whatever the exposure: a covered lens, a flash and noise
     correlate with nothing, where the depth may still agree or be missing. Real frames: 0.92 and more. [ours]"""
 
