@@ -66,13 +66,13 @@ def walk(count: int) -> list[Pose]:
     return poses
 
 
-def rendering_of(frame: Frame, *, confidence: float = 1.0, alpha: float = 0.99) -> Rendering:
-    """The view of a perfect map: what the frame itself shows, evenly covered."""
-    coverage = torch.full_like(frame.depth, alpha)
+def rendering_of(frame: Frame, *, confidence: float = 1.0, alpha: float | Tensor = 0.99) -> Rendering:
+    """The view of a perfect map: what the frame itself shows, where it is covered."""
+    coverage = torch.as_tensor(alpha).expand_as(frame.depth)
     return Rendering(
-        color=frame.color * alpha,
-        composited_depth=frame.depth * alpha,
-        composited_plane_depth=frame.depth * alpha,
+        color=frame.color * coverage[..., None],
+        composited_depth=frame.depth * coverage,
+        composited_plane_depth=frame.depth * coverage,
         alpha=coverage,
         confidence=confidence * coverage,
         visible=torch.zeros(0, dtype=torch.bool),
