@@ -195,7 +195,7 @@ class TestSurfaceRecipe:
 
 
 class TestPointsRecipe:
-    def test_the_first_frame_takes_its_number_and_every_edge(self, room: Room) -> None:
+    def test_the_first_frame_takes_its_number_and_every_edge(self) -> None:
         grey = Room(contrast=0.0).frame()
         assert len(seeded(grey, POINTS)) == 700
         stripe = grey.color.clone()

@@ -55,8 +55,8 @@ class RowAdam:
         return replace(self._template, **self._parameters)
 
     def detached(self) -> Gaussians:
-        """The Gaussians as they are now, as plain values."""
-        return replace(self._template, **{name: p.detach() for name, p in self._parameters.items()})
+        """The Gaussians as they are now, as plain values that later steps leave alone."""
+        return replace(self._template, **{name: p.detach().clone() for name, p in self._parameters.items()})
 
     def step(self, loss: Tensor, frozen: tuple[str, ...] = (), gradient_scale: PerGaussian | None = None,
              step_scale: PerGaussian | None = None) -> None:  # fmt: skip

@@ -169,7 +169,8 @@ def _born(
 def _surface_seeds(
     frame: Frame, T_map_cam: Pose, mask: Mask, sh_degree: int, ids: IdSource, config: SeedingConfig
 ) -> Gaussians:
-    chosen = mask & _lattice(*mask.shape, config.spacing)
+    height, width = mask.shape
+    chosen = mask & _lattice(height, width, config.spacing)
     depth = frame.depth[chosen]
     points = (frame.camera.rays() * frame.depth[..., None])[chosen] * (1 + config.push_back)
     normals = surface_normals(frame.depth, frame.camera)[chosen]
