@@ -1,0 +1,71 @@
+"""When frames are mapped and submaps end."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic_room import Room, pose
+
+from tcgsplat.errors import ConfigError
+from tcgsplat.geometry import se3
+from tcgsplat.mapping.schedule import Schedule, ScheduleConfig
+from tcgsplat.scene.submap import Keyframe, Submap
+
+MOTION = ScheduleConfig(map_every=4, submap_by="motion", submap_distance=0.5, submap_angle=50.0)
+INTERVAL = ScheduleConfig(map_every=4, submap_by="interval", submap_interval=30)
+EMPTY = Submap.anchored(se3.identity(), index=0)
+HERE = se3.identity()
+
+
+def submap(*mapped: int) -> Submap:
+    frames = [Room().frame(index=index) for index in mapped]
+    return replace(EMPTY, keyframes=tuple(Keyframe(frame, se3.identity()) for frame in frames))
+
+
+@pytest.mark.parametrize("config", [MOTION, INTERVAL])
+def test_the_first_frame_is_mapped_and_begins_no_second_submap(config: ScheduleConfig) -> None:
+    schedule = Schedule(config)
+    assert schedule.maps(0, EMPTY)
+    assert schedule.maps(77, EMPTY)
+    assert not schedule.switches_submap(77, pose(9.0), EMPTY)
+
+
+def test_mapping_comes_round_after_the_last_mapped_frame() -> None:
+    schedule = Schedule(MOTION)
+    assert [i for i in range(11, 20) if schedule.maps(i, submap(3, 10))] == [14, 15, 16, 17, 18, 19]
+
+
+@pytest.mark.parametrize(
+    ("T_map_cam", "ends"),
+    [
+        (pose(0.49), False),
+        (pose(0.51), True),
+        (pose(0.3, 0.3, 0.3), True),
+        (pose(-0.2, -0.2, -0.2), False),
+        (pose(degrees=(0, 49.5, 0)), False),
+        (pose(degrees=(0, 50.5, 0)), True),
+        (pose(degrees=(30, -30, 30)), True),  # each axis is within, the rotation is not
+        (pose(degrees=(0, 0, 179)), True),
+    ],
+)
+def test_motion_ends_a_submap_by_distance_or_by_angle(T_map_cam: torch.Tensor, ends: bool) -> None:
+    assert Schedule(MOTION).switches_submap(1, T_map_cam, submap(0)) is ends
+    assert not Schedule(INTERVAL).switches_submap(1, T_map_cam, submap(0))
+
+
+def test_frames_end_a_submap_by_their_number() -> None:
+    schedule = Schedule(INTERVAL)
+    assert [i for i in range(35, 45) if schedule.switches_submap(i, HERE, submap(10, 20, 34))] == [40, 41, 42, 43, 44]
+    assert not Schedule(MOTION).switches_submap(1000, HERE, submap(10))
+
+
+@pytest.mark.parametrize("name", ["map_every", "submap_distance", "submap_angle", "submap_interval"])
+@pytest.mark.parametrize("value", [0, -1])
+def test_rhythm_that_cannot_be_is_refused_by_name(name: str, value: int) -> None:
+    with pytest.raises(ConfigError, match=rf"schedule\.{name} is {value}; it must be above 0"):
+        replace(MOTION, **{name: value})  # type: ignore[arg-type]
+
+
+def test_an_unknown_rule_is_refused_by_name() -> None:
+    with pytest.raises(ConfigError, match=r"schedule\.submap_by is 'mood'; choose motion or interval"):
+        ScheduleConfig(submap_by="mood")  # type: ignore[arg-type]
