@@ -132,9 +132,16 @@ class NumbaRasterizer:
 
     name = "numba"
 
-    def __init__(self, threads: int | None = None) -> None:
-        """Use `threads` workers, by default as many as this process may run on."""
+    def __init__(self, threads: int | None = None, lap: Callable[[str], object] = lambda stage: None) -> None:
+        """A rasterizer on the CPU.
+
+        Args:
+            threads: Workers, by default as many as this process may run on.
+            lap: Called with its name at the end of every stage: pack, project, sort, bin, forward; backward, chain.
+                What comes before each pass, which is torch's, ends as `autograd`. For benchmarks.
+        """
         self.device = torch.device("cpu")
+        self._lap = lap
         self._workers = Workers(threads or available_cores())
         self._grid: Floats = aligned(LANE_GRID.shape)  # type: ignore[assignment]
         self._grid[:] = LANE_GRID
@@ -165,7 +172,9 @@ class NumbaRasterizer:
 
     def forward(self, splats: Splats, camera: Camera, T_cam_map: Tensor) -> tuple[_Drawn, Floats, Any]:
         """Project, sort, bin and composite: the state for backward, the planes, and which splats are visible."""
+        self._lap("autograd")
         P, padded = _packed(splats)
+        self._lap("pack")
         n = splats.means.shape[0]
         cam = _camera_vector(camera, T_cam_map)
         workers, flat = self._workers, P.reshape(-1)
@@ -175,15 +184,18 @@ class NumbaRasterizer:
         workers.run(
             lambda a, b: projection.forward(flat, padded, a, b, cam, records, depths, tiles), workers.cuts(padded, 16)
         )
+        self._lap("project")
 
         tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
         order = np.empty(padded, np.int32)
         visible_count = tiling.depth_order(depths.view(np.uint32), tiles, padded, order)
+        self._lap("sort")
         tile_ends = np.empty(tiles_x * tiles_y + 1, np.int32)
         slot_starts = np.empty(padded + 1, np.int32)
         pairs = tiling.count_pairs(tiles, padded, tiles_x, tile_ends, slot_starts)
         pair_splats, slot_pairs = np.zeros(pairs + 1, np.int32), np.empty(pairs, np.int32)
         tiling.fill_pairs(order, visible_count, tiles, padded, tiles_x, tile_ends, slot_starts, pair_splats, slot_pairs)
+        self._lap("bin")
 
         masks = np.empty(pairs, np.int32)
         image: Floats = aligned(tiles_x * tiles_y * TILE_FLOATS)  # type: ignore[assignment]
@@ -198,10 +210,12 @@ class NumbaRasterizer:
             n, padded, flat, cam, tiles_x, tile_ends, pair_splats, slot_starts, slot_pairs, records, masks, image,
             camera.width, camera.height,
         )  # fmt: skip
+        self._lap("forward")
         return drawn, planes, np.diff(slot_starts[: n + 1]) > 0
 
     def backward(self, drawn: _Drawn, d_planes: Floats) -> tuple[Floats, npt.NDArray[np.float64]]:
         """Derivatives by the parameters [PARAMETERS, padded] and by the pose [4, 4]."""
+        self._lap("autograd")
         workers, padded = self._workers, drawn.padded
         d_image: Floats = aligned(drawn.image.size)  # type: ignore[assignment]
         pair_sums: Floats = aligned(max(drawn.masks.size, 1) * RECORD)  # type: ignore[assignment]
@@ -214,6 +228,7 @@ class NumbaRasterizer:
             )  # fmt: skip
 
         workers.run(composite, workers.weighted_cuts(drawn.tile_ends))
+        self._lap("backward")
 
         grads: Floats = aligned((PARAMETERS, padded))  # type: ignore[assignment]
         flat = grads.reshape(-1)
@@ -235,6 +250,7 @@ class NumbaRasterizer:
         pose = pose_sums.astype(np.float64).sum(axis=0)
         d_T = np.zeros((4, 4))
         d_T[:3, :3], d_T[:3, 3] = pose[:9].reshape(3, 3), pose[9:]
+        self._lap("chain")
         return grads, d_T
 
 

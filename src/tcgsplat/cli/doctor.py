@@ -1,0 +1,80 @@
+"""`tcgsplat doctor`: which backend this machine can use, why not another, and what to do about it."""
+
+import importlib.util
+import os
+import platform
+import sys
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+
+from tcgsplat.cli.summary import machine, versions
+
+
+@dataclass(frozen=True)
+class Args:
+    """Look at this machine; needs no arguments."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What is known of one backend."""
+
+    backend: str
+    usable: bool
+    facts: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """A headline and a line for each fact."""
+        lines = (f"{self.backend}: {'usable' if self.usable else 'not usable'}", *self.facts)
+        return "\n  ".join(lines)
+
+
+def command(args: Args) -> int:  # noqa: ARG001
+    """Print the findings; the exit code is 0 if `tcgsplat run` can work here."""
+    packages = ", ".join(f"{name} {number}" for name, number in versions().items())
+    findings = (numba_finding(), cuda_finding(), Finding("reference", True, ("plain torch, slow: for checking",)))
+    sys.stdout.write(f"{packages}\n{platform.platform()}; {machine()}\n")
+    sys.stdout.writelines(f"{finding}\n" for finding in findings)
+    return 0 if findings[0].usable else 1
+
+
+def numba_finding() -> Finding:
+    """The CPU backend."""
+    try:
+        from tcgsplat.render.numba_cpu import blending
+    except (ImportError, RuntimeError) as error:  # numba raises the latter where it finds no place for its cache
+        advice = "set NUMBA_CACHE_DIR to a folder that can be written, or install numba again"
+        return Finding("numba", False, (f"the kernels cannot be loaded: {error}; {advice}",))
+    from llvmlite import binding
+
+    cache = Path(str(blending.forward.stats.cache_path))
+    compiled = any(cache.glob("blending.forward*.nbi"))
+    place = f"compiled kernels are kept in {cache}"
+    facts = (
+        "the default, on the CPU",
+        "AVX-512: yes, the kernels' vectors fill its registers"
+        if binding.get_host_cpu_features().get("avx512f")
+        else "AVX-512: no; results are the same, more slowly; a processor with AVX-512 is faster",
+        f"{place}; {'they are there' if compiled else 'none yet: the first run takes some ten seconds longer'}"
+        if os.access(cache if cache.exists() else cache.parent, os.W_OK)
+        else f"{place}, which cannot be written: every run compiles anew; set NUMBA_CACHE_DIR to another folder",
+    )
+    return Finding("numba", True, facts)
+
+
+def cuda_finding() -> Finding:
+    """The GPU backend, which this version does not have."""
+    built = torch.version.cuda
+    if built is None:
+        device = f"torch {version('torch')} is built without CUDA; a build with it would see a GPU"
+    elif torch.cuda.is_available():
+        device = f"torch is built for CUDA {built} and sees {torch.cuda.get_device_name()}"
+    else:
+        device = f"torch is built for CUDA {built} and sees no GPU; `nvidia-smi` tells whether the driver does"
+    gsplat = "is installed" if importlib.util.find_spec("gsplat") else "is not installed"
+    return Finding(
+        "cuda", False, ("not built yet in this version: nothing to do but use the CPU", device, f"gsplat {gsplat}")
+    )

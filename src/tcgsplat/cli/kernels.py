@@ -1,0 +1,81 @@
+"""Getting the CPU kernels compiled before the clock starts, and saying so when that takes long."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import torch
+from numba.core import event
+
+from tcgsplat.config import SlamConfig, with_settings
+from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.scene.frame import Frame
+from tcgsplat.slam import Slam
+
+_ONE_STEP = {
+    "tracker.descent.iterations": 1,
+    "mapper.iterations": 1,
+    "mapper.first_iterations": 1,
+    "schedule.map_every": 1,
+}
+
+
+def compile_kernels(config: SlamConfig, rasterizer: Rasterizer, announce: Callable[[], object]) -> float:
+    """Have every kernel that a run needs loaded or compiled, by a throw-away run over two tiny frames.
+
+    Args:
+        config: Settings of the run to come.
+        rasterizer: Its backend.
+        announce: Called once if something has to be compiled, before that is done.
+
+    Returns:
+        Seconds that it took: a fraction of one where the kernels come from numba's cache.
+    """
+    started = time.perf_counter()
+    slam = Slam(with_settings(config, _ONE_STEP), rasterizer)
+    with _heard_compiling(announce):
+        for index in range(2):
+            slam.step(_wall(index))
+    return time.perf_counter() - started
+
+
+def _wall(index: int) -> Frame:
+    """A checkered wall at 1.5 metres."""
+    height, width = 48, 64
+    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    shade = 0.3 + 0.4 * ((u // 6 + v // 6) % 2).float()
+    return Frame(
+        index=index,
+        timestamp=index / 30,
+        color=shade[..., None].repeat(1, 1, 3),
+        depth=torch.full((height, width), 1.5),
+        valid=torch.ones(height, width, dtype=torch.bool),
+        camera=Camera(60.0, 60.0, 31.5, 23.5, width, height),
+    )
+
+
+class _First(event.Listener):  # type: ignore[misc]
+    """Calls a function at the first event."""
+
+    def __init__(self, announce: Callable[[], object]) -> None:
+        self._announce = announce
+        self._done = False
+
+    def on_start(self, event: event.Event) -> None:  # noqa: ARG002
+        if not self._done:
+            self._done = True
+            self._announce()
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+@contextmanager
+def _heard_compiling(announce: Callable[[], object]) -> Iterator[None]:
+    listener = _First(announce)
+    event.register("numba:compile", listener)  # type: ignore[no-untyped-call]
+    try:
+        yield
+    finally:
+        event.unregister("numba:compile", listener)  # type: ignore[no-untyped-call]

@@ -1,0 +1,46 @@
+"""What the library logs, on the terminal: a few lines of each kind, then only their number."""
+
+import logging
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+SHOWN = 5
+"""Warnings of one kind that are shown in full."""
+
+
+class Capped(logging.Handler):
+    """Writes records to standard error, of each kind (the same message but for its values) `SHOWN` at most."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._seen: Counter[str] = Counter()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write the record as one line, unless enough like it have been seen."""
+        kind = str(record.msg)
+        self._seen[kind] += 1
+        if self._seen[kind] <= SHOWN or record.levelno < logging.WARNING:
+            label = "warning: " if record.levelno >= logging.WARNING else ""
+            sys.stderr.write(f"tcgsplat: {label}{record.getMessage()}\n")
+
+    def summarize(self) -> None:
+        """Say how many records of each kind were not shown."""
+        for kind, count in self._seen.items():
+            if count > SHOWN:
+                sys.stderr.write(f"tcgsplat: warning: {count - SHOWN} more like {kind!r}\n")
+
+
+@contextmanager
+def on_stderr(debug: bool) -> Iterator[None]:
+    """Show the package's warnings, or with `debug` all that it logs, while the block runs."""
+    logger = logging.getLogger("tcgsplat")
+    handler = Capped()
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG if debug else logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        handler.summarize()

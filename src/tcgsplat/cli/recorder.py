@@ -1,0 +1,162 @@
+"""A SLAM run, written down as it goes."""
+
+import json
+import shlex
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from tcgsplat.cli.kernels import compile_kernels
+from tcgsplat.cli.progress import RunProgress, say
+from tcgsplat.cli.summary import Summary, Tally
+from tcgsplat.config import SlamConfig, to_toml
+from tcgsplat.datasets import Sequence, open_sequence
+from tcgsplat.errors import ArchiveError
+from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.scene.frame import Frame
+from tcgsplat.slam import Slam, StepReport
+from tcgsplat.storage import atomic
+from tcgsplat.storage.run_directory import RunDirectory
+
+
+@dataclass(frozen=True)
+class Part:
+    """Which frames of a sequence a run uses; their indices count what was selected."""
+
+    start: int = 0
+    stride: int = 1
+    limit: int | None = None
+
+    def open(self, folder: Path | str) -> Sequence:
+        """The part of the sequence in a folder.
+
+        Raises:
+            DatasetError: if there is no such sequence or part.
+        """
+        return open_sequence(folder, start=self.start, stride=self.stride, limit=self.limit)
+
+    def write(self, run: RunDirectory) -> None:
+        """Put it into the run directory as `request.json`, with the command line for people."""
+        request = {"command": shlex.join(["tcgsplat", *sys.argv[1:]]), **asdict(self)}
+        atomic.write_text(run.path / "request.json", json.dumps(request, indent=2) + "\n")
+
+    @staticmethod
+    def of(run: RunDirectory) -> "Part":
+        """That of a run; the whole sequence where the run does not say.
+
+        Raises:
+            ArchiveError: if `request.json` is there and makes no sense.
+        """
+        path = run.path / "request.json"
+        if not path.exists():
+            return Part()
+        try:
+            request = json.loads(path.read_text(encoding="utf-8"))
+            return Part(request["start"], request["stride"], request["limit"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ArchiveError(f"cannot read {path} ({error}); run again") from error
+
+
+def begin(path: Path, config: SlamConfig, folder: Path, part: Part, *, overwrite: bool) -> RunDirectory:
+    """A new run directory that knows its settings and its data.
+
+    Raises:
+        ArchiveError: if there is something at `path` already that may not be, or cannot be, replaced.
+    """
+    if path.exists() and any(path.iterdir() if path.is_dir() else [path]):
+        if not overwrite:
+            raise ArchiveError(f"{path} exists; choose another folder by --out, or replace the run by --overwrite")
+        shutil.rmtree(RunDirectory.open(path).path)  # `open` refuses a folder that holds no run
+    run = RunDirectory.create(path, config_toml=to_toml(config), sequence=str(folder.expanduser().resolve()))
+    part.write(run)
+    return run
+
+
+def recorded(sequence: Sequence, config: SlamConfig, rasterizer: Rasterizer, run: RunDirectory, preset: str) -> Summary:
+    """A whole run with progress on the terminal; its summary is on disk too.
+
+    Raises:
+        KeyboardInterrupt: at the second Ctrl-C, saying what is on disk.
+    """
+    compiling = compile_kernels(
+        config, rasterizer, lambda: say("compiling kernels, once per machine: some ten seconds")
+    )
+    try:
+        with RunProgress(len(sequence)) as progress, stopping_on_interrupt() as stop:
+            summary = record(Slam(config, rasterizer), sequence, run, progress.observe, stop.is_set)
+    except KeyboardInterrupt as interrupt:
+        saved = f"{run.submap_count} submaps sealed before are saved"
+        raise KeyboardInterrupt(f"stopped at once; {saved}: {run.path}") from interrupt
+    summary = replace(summary, seconds_compiling=compiling, backend=rasterizer.name, preset=preset)
+    run.write_summary(summary.to_dict())
+    return summary
+
+
+def record(
+    slam: Slam,
+    frames: Iterable[Frame],
+    run: RunDirectory,
+    observe: Callable[[StepReport], object],
+    stopped: Callable[[], bool],
+) -> Summary:
+    """Step SLAM through the frames; each sealed submap and the path so far are on disk before the next frame.
+
+    Args:
+        slam: A fresh system.
+        frames: In order of time.
+        run: Where to write.
+        observe: Called with every report.
+        stopped: Asked after every frame; if true, what there is gets sealed and the run ends.
+
+    Returns:
+        The summary, not yet written: the caller knows more about the run.
+    """
+    tally, gaussians, stop = Tally(), 0, False
+    started = before = time.perf_counter()
+    for frame in frames:
+        report = slam.step(frame)
+        if report.sealed is not None:
+            run.write_submap(report.sealed)
+            run.write_trajectory(slam.trajectory, slam.atlas)
+            gaussians += len(report.sealed)
+        observe(report)
+        now = time.perf_counter()
+        tally.count(report, now - before)
+        before = now
+        stop = stopped()
+        if stop:
+            break
+    last = slam.finish()
+    if last is not None:
+        run.write_submap(last)
+        gaussians += len(last)
+    run.write_trajectory(slam.trajectory, slam.atlas)
+    return tally.summary(
+        submaps=run.submap_count,
+        gaussians=gaussians,
+        seconds=time.perf_counter() - started,
+        interrupted=stop,
+    )
+
+
+@contextmanager
+def stopping_on_interrupt() -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets, so that a frame is never left half mapped; the second one is as ever."""
+    stop = threading.Event()
+
+    def first(*_: object) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, previous)
+        sys.stderr.write("tcgsplat: stopping after this frame; Ctrl-C again to stop at once\n")
+
+    previous = signal.signal(signal.SIGINT, first)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, previous)

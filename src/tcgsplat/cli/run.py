@@ -1,0 +1,60 @@
+"""`tcgsplat run`: a recorded sequence in, a run directory out."""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from tcgsplat.cli.recorder import Part, begin, recorded
+from tcgsplat.cli.settings import Flags, resolved
+from tcgsplat.render.backends import open_rasterizer
+
+
+@dataclass(frozen=True)
+class Args:
+    """Map a recorded RGB-D sequence; TUM RGB-D, Replica, ScanNet and plain folders are recognised by themselves.
+
+    Every setting is a flag too, e.g. --mapper.iterations 20 --tracker.solver descent --confidence.guide-mapping false;
+    `tcgsplat presets default` lists them. A flag counts more than the file, the file more than the preset. Ctrl-C ends
+    the run after the current frame and saves what there is.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """The sequence."""
+    out: Path | None = None
+    """The run directory; runs/NAME if left out, with the name of the folder."""
+    preset: str = "default"
+    """Where the settings start from: see `tcgsplat presets`."""
+    config: Path | None = None
+    """A TOML file of settings, such as the config.toml of another run."""
+    start: int = 0
+    """First frame, counted from 0."""
+    stride: int = 1
+    """Use every so many-th frame."""
+    limit: int | None = None
+    """Use no more than so many frames."""
+    backend: str = "auto"
+    """Rasterizer: auto, numba or reference."""
+    seed: int | None = None
+    """Of all randomness; that of the preset if left out."""
+    overwrite: bool = False
+    """Replace the run directory if there is a run in it."""
+    settings: Flags = field(default_factory=dict)
+    """Put here from the flags with a dot."""
+
+
+def command(args: Args) -> int:
+    """Run, and say in one line what came of it."""
+    config = resolved(args.preset, args.config, args.settings, args.seed)
+    part = Part(args.start, args.stride, args.limit)
+    sequence = part.open(args.folder)
+    rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
+    out = args.out or Path("runs") / sequence.name
+    run = begin(out, config, args.folder, part, overwrite=args.overwrite)
+    summary = recorded(sequence, config, rasterizer, run, args.preset)
+    if summary.interrupted:
+        sys.stderr.write(f"tcgsplat: stopped; saved {summary}: {run.path}\n")
+        return 130
+    sys.stdout.write(f"{summary}: {run.path}\n")
+    return 0

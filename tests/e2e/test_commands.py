@@ -1,0 +1,297 @@
+"""The commands as a person types them, on a small recorded room: real processes, real files, real kills."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from analytic_room import CAMERA, Room, walk
+
+from tcgsplat.cli import demo
+from tcgsplat.cli.main import main
+from tcgsplat.config import SlamConfig, from_toml, with_settings
+from tcgsplat.datasets import open_sequence
+from tcgsplat.geometry import se3
+from tcgsplat.scene.trajectory import format_tum, parse_tum
+from tcgsplat.storage.ply import read_gaussians
+from tcgsplat.storage.run_directory import RunDirectory
+
+FRAMES = 24
+SHORT_SUBMAPS = ["--schedule.submap_by", "interval", "--schedule.submap-interval", "8"]
+SLOW = ["--mapper.iterations", "60", "--schedule.map_every", "1"]
+PATIENCE = 120  # seconds for what takes a few on an idle machine
+
+
+def record_room(folder: Path) -> Path:
+    """The analytic room in TUM layout."""
+    (folder / "rgb").mkdir(parents=True)
+    (folder / "depth").mkdir()
+    rows: dict[str, list[str]] = {"rgb": [], "depth": []}
+    poses = walk(FRAMES)
+    for index, T_world_cam in enumerate(poses):
+        frame = Room().frame(T_world_cam, index)
+        color = (255 * frame.color.clamp(0, 1)).round().byte().numpy()
+        depth = (5000 * frame.depth).round().numpy().astype(np.uint16)
+        for kind, image in (("rgb", color[..., ::-1]), ("depth", depth)):
+            name = f"{kind}/{index:04d}.png"
+            assert cv2.imwrite(str(folder / name), np.ascontiguousarray(image))
+            rows[kind].append(f"{frame.timestamp:.6f} {name}")
+    for kind, lines in rows.items():
+        (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n")
+    (folder / "groundtruth.txt").write_text(format_tum([i / 30 for i in range(FRAMES)], poses))
+    camera = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    text = "".join(f"{name} = {value}\n" for name, value in (camera | {"depth_scale": 5000.0}).items())
+    (folder / "camera.toml").write_text(text)
+    return folder
+
+
+def tcgsplat(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """The command in a process of its own, its output in pipes."""
+    return subprocess.run(line(*arguments), capture_output=True, text=True, timeout=PATIENCE)
+
+
+def line(*arguments: str | Path) -> list[str]:
+    return [sys.executable, "-m", "tcgsplat.cli.main", *map(str, arguments)]
+
+
+@pytest.fixture(scope="session")
+def room_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record_room(tmp_path_factory.mktemp("data") / "room")
+
+
+@pytest.fixture(scope="session")
+def finished(room_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProcess[str]:
+    """`tcgsplat run` over the whole room, in three submaps; the last argument is the run directory."""
+    out = tmp_path_factory.mktemp("runs") / "room"
+    return tcgsplat("run", room_folder, *SHORT_SUBMAPS, "--out", out)
+
+
+@pytest.fixture
+def run(finished: subprocess.CompletedProcess[str], tmp_path: Path) -> RunDirectory:
+    """A copy of the finished run."""
+    return RunDirectory.open(Path(shutil.copytree(finished.args[-1], tmp_path / "room")))
+
+
+def test_run_is_quiet_in_a_pipe_and_leaves_a_whole_run(finished: subprocess.CompletedProcess[str]):
+    assert finished.returncode == 0, finished.stderr
+    assert finished.stderr == ""
+    out = finished.args[-1]
+    (said,) = finished.stdout.splitlines()
+    assert said.startswith(f"{FRAMES} frames in ") and said.endswith(f" Gaussians: {out}")
+
+    run = RunDirectory.open(Path(out))
+    trajectory, atlas = run.trajectory()
+    assert [row.frame_index for row in trajectory.rows] == list(range(FRAMES))
+    assert run.submap_count == len(atlas) == 3
+    assert sum(len(run.load_submap(i)) for i in range(3)) == run.summary()["gaussians"]
+    summary = run.summary()
+    assert (summary["frames"], summary["frames_lost"], summary["submaps"]) == (FRAMES, 0, 3)
+    assert (summary["backend"], summary["preset"], summary["interrupted"]) == ("numba", "default", False)
+    for name in ("seconds", "ms_per_frame", "ms_per_frame_median", "ms_track", "ms_map", "peak_rss_mb"):
+        assert summary[name] > 0, name
+    asked = {"schedule.submap_by": "interval", "schedule.submap_interval": 8}
+    assert from_toml(run.config_toml) == with_settings(SlamConfig(), asked)
+
+
+def test_eval_then_export(run: RunDirectory, capsys: pytest.CaptureFixture[str]):
+    assert main(["eval", str(run.path)]) == 0
+    table = capsys.readouterr().out
+    report = json.loads((run.path / "report.json").read_text())
+    for name in ("ate_rmse", "psnr", "ssim", "depth_l1", "frames", "ms_per_frame", "peak_rss_mb"):
+        assert {"value", "unit"} <= report[name].keys() and name in table
+    assert report["frames"]["value"] == FRAMES
+    assert report["ate_rmse"]["value"] < 1.0 and report["ate_rmse"]["unit"] == "cm"
+    assert report["psnr"]["value"] > 20
+    for name in ("contact_sheet.png", "trajectory.png"):
+        picture = cv2.imread(str(run.path / name))
+        assert picture is not None and picture.std() > 10
+
+    assert main(["export", str(run.path)]) == 0
+    gaussians, confidence = read_gaussians(run.path / "map.ply")
+    assert len(gaussians) == run.summary()["gaussians"]
+    assert confidence is not None and 0 < confidence.min() < confidence.max() <= 1
+    submap = run.load_submap(2)
+    world = submap.T_world_map[:3, :3].float() @ submap.gaussians.means[-1] + submap.T_world_map[:3, 3].float()
+    torch.testing.assert_close(gaussians.means[-1], world, atol=1e-5, rtol=0)
+    torch.testing.assert_close(confidence[-1], submap.confidence.value[-1])
+
+
+def test_export_writes_only_what_was_asked_for(run: RunDirectory, tmp_path: Path):
+    assert main(["export", str(run.path), "--trajectory", "--out", str(tmp_path / "path")]) == 0
+    assert [path.name for path in (tmp_path / "path").iterdir()] == ["trajectory.txt"]
+    assert (tmp_path / "path" / "trajectory.txt").read_bytes() == (run.path / "trajectory.txt").read_bytes()
+    assert main(["export", str(run.path), "--ply", "--out", str(tmp_path / "map")]) == 0
+    assert [path.name for path in (tmp_path / "map").iterdir()] == ["map.ply"]
+
+
+def test_eval_scores_the_trajectory_of_any_system(run: RunDirectory, room_folder: Path, tmp_path: Path, capsys):
+    stamps, poses = parse_tum((room_folder / "groundtruth.txt").read_text())
+    elsewhere = se3.exp(torch.tensor([3.0, 1.0, -2.0, 0.4, -0.9, 0.2], dtype=torch.float64))
+    (tmp_path / "other.txt").write_text(format_tum(stamps, [elsewhere @ T for T in poses]))
+    assert main(["eval", str(run.path), "--trajectory", str(tmp_path / "other.txt")]) == 0
+    report = json.loads((run.path / "report_other.json").read_text())
+    assert report["ate_rmse"]["value"] < 1e-6 and report["frames"]["value"] == FRAMES
+    assert not (run.path / "report.json").exists()
+    assert main(["eval", "--sequence", str(room_folder), "--trajectory", str(tmp_path / "other.txt")]) == 0
+    assert "ate_rmse" in capsys.readouterr().out
+
+
+def test_eval_knows_which_part_of_the_data_was_used(room_folder: Path, tmp_path: Path):
+    part = ["--start", "3", "--stride", "2", "--limit", "8"]
+    assert main(["run", str(room_folder), *part, "--out", str(tmp_path / "part")]) == 0
+    assert main(["eval", str(tmp_path / "part")]) == 0
+    report = json.loads((tmp_path / "part" / "report.json").read_text())
+    assert report["frames"]["value"] == 8
+    assert report["ate_rmse"]["value"] < 1.0  # against the wrong frames it would be 5 cm
+
+
+def test_eval_without_the_data_says_so_and_goes_on(run: RunDirectory, capsys: pytest.CaptureFixture[str]):
+    about = json.loads((run.path / "run.json").read_text())
+    (run.path / "run.json").write_text(json.dumps(about | {"sequence": "/gone/away"}))
+    assert main(["eval", str(run.path)]) == 0
+    assert "warning: /gone/away, the data of the run, is not there" in capsys.readouterr().err
+    report = json.loads((run.path / "report.json").read_text())
+    assert "ate_rmse" not in report and report["psnr"]["value"] > 20
+
+
+def test_the_same_command_twice_gives_the_same_bytes(
+    finished: subprocess.CompletedProcess[str], room_folder: Path, tmp_path: Path
+):
+    first = Path(finished.args[-1])
+    assert tcgsplat("run", room_folder, "--config", first / "config.toml", "--out", tmp_path / "again").returncode == 0
+    assert (tmp_path / "again" / "trajectory.txt").read_bytes() == (first / "trajectory.txt").read_bytes()
+    for index in range(3):
+        a, b = (RunDirectory.open(path).load_submap(index) for path in (first, tmp_path / "again"))
+        assert torch.equal(a.gaussians.means, b.gaussians.means)
+        assert torch.equal(a.confidence.value, b.confidence.value)
+
+
+@pytest.mark.parametrize("poison", ["garbage", "folder", "absent"])
+def test_the_ground_truth_plays_no_part_in_a_run(
+    finished: subprocess.CompletedProcess[str], room_folder: Path, tmp_path: Path, poison: str, capsys
+):
+    data = Path(shutil.copytree(room_folder, tmp_path / "room"))
+    (data / "groundtruth.txt").unlink()
+    if poison == "garbage":
+        (data / "groundtruth.txt").write_bytes(b"\xff\x00 not a pose\n")
+    elif poison == "folder":
+        (data / "groundtruth.txt").mkdir()
+    assert main(["run", str(data), *SHORT_SUBMAPS, "--out", str(tmp_path / "run")]) == 0
+    unpoisoned = Path(finished.args[-1]) / "trajectory.txt"
+    assert (tmp_path / "run" / "trajectory.txt").read_bytes() == unpoisoned.read_bytes()
+    capsys.readouterr()
+    assert main(["eval", str(tmp_path / "run")]) == (0 if poison == "absent" else 1)
+    said = capsys.readouterr()
+    assert "no ground truth" in said.out if poison == "absent" else "groundtruth.txt" in said.err
+
+
+def started(*arguments: str | Path, submaps: Path) -> subprocess.Popen[str]:
+    """A run that has sealed a submap and is still going."""
+    process = subprocess.Popen(line(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + PATIENCE
+    while not (submaps / "0000.npz").exists():
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+        time.sleep(0.005)
+    assert process.poll() is None
+    return process
+
+
+def test_a_killed_run_loses_no_sealed_submap(room_folder: Path, tmp_path: Path):
+    out = tmp_path / "killed"
+    process = started("run", room_folder, *SHORT_SUBMAPS, *SLOW, "--out", out, submaps=out / "submaps")
+    process.kill()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    run = RunDirectory.open(out)
+    assert run.summary() == {}
+    assert 1 <= run.submap_count < 3
+    for index in range(run.submap_count):
+        assert len(run.load_submap(index)) > 100
+    assert main(["eval", str(out)]) == 0
+    assert "ms_per_frame" in json.loads((out / "report.json").read_text())["evaluated"]["missing"]
+
+
+def test_ctrl_c_saves_what_there_is(room_folder: Path, tmp_path: Path):
+    out = tmp_path / "stopped"
+    process = started("run", room_folder, *SHORT_SUBMAPS, *SLOW, "--out", out, submaps=out / "submaps")
+    process.send_signal(signal.SIGINT)
+    said, complaints = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130 and said == ""
+    announced, told = complaints.splitlines()
+    assert announced == "tcgsplat: stopping after this frame; Ctrl-C again to stop at once"
+    assert told.startswith("tcgsplat: stopped; saved ") and told.endswith(str(out))
+    run = RunDirectory.open(out)
+    trajectory, _ = run.trajectory()
+    assert run.summary()["interrupted"] is True
+    assert 8 <= len(trajectory) < FRAMES
+    assert {row.submap_index for row in trajectory.rows} == set(range(run.submap_count))
+    assert main(["eval", str(out)]) == 0
+
+
+def test_broken_frames_are_skipped_and_told(room_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    data = Path(shutil.copytree(room_folder, tmp_path / "room"))
+    (data / "rgb" / "0005.png").write_bytes(b"no picture")
+    assert main(["run", str(data), "--limit", "9", "--out", str(tmp_path / "run")]) == 0
+    said = capsys.readouterr()
+    (warning,) = said.err.splitlines()
+    assert warning.startswith("tcgsplat: warning: frame 5 is skipped: ") and "0005.png" in warning
+    assert said.out.startswith("8 frames in ")
+
+
+def test_a_run_goes_to_runs_and_is_not_overwritten_by_accident(
+    room_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", str(room_folder), "--limit", "2"]) == 0
+    assert RunDirectory.open(tmp_path / "runs" / "room").submap_count == 1
+    assert main(["run", str(room_folder), "--limit", "3"]) == 1
+    assert "runs/room exists; choose another folder by --out, or replace the run" in capsys.readouterr().err
+    assert main(["run", str(room_folder), "--limit", "3", "--overwrite"]) == 0
+    assert len(RunDirectory.open(tmp_path / "runs" / "room").trajectory()[0]) == 3
+
+
+def test_synth_writes_a_sequence(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "apartment"
+    assert main(["synth", str(out), "--frames", "3", "--width", "64", "--height", "48", "--depth-noise"]) == 0
+    assert capsys.readouterr().out == f"3 frames, 64x48: {out}\n"
+    sequence = open_sequence(out)
+    assert len(list(sequence)) == len(sequence.ground_truth()) == 3
+    assert main(["synth", str(out)]) == 1
+    assert "exists and is not an empty folder" in capsys.readouterr().err
+
+
+def test_demo_makes_everything_that_it_shows(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    small = ["demo", "--out", str(tmp_path / "demo"), "--frames", "4", "--width", "64"]
+    assert main(small) == 0
+    text = capsys.readouterr().out
+    shown = [Path(word) for word in text.split() if word.startswith(str(tmp_path))]
+    assert [path.name for path in shown] == ["contact_sheet.png", "trajectory.png", "map.ply", "report.json"]
+    assert all(path.stat().st_size > 100 for path in shown)
+    report = json.loads(shown[-1].read_text())
+    assert all(f"{name} " in text for name in report if name != "evaluated")
+
+    assert main(small) == 1
+    assert "exists; choose another folder by --out, or make it anew by --overwrite" in capsys.readouterr().err
+    (tmp_path / "demo" / "letter.txt").write_text("dear")
+    assert main([*small, "--overwrite"]) == 1
+    assert "holds more than a demo" in capsys.readouterr().err
+    assert (tmp_path / "demo" / "sequence" / "rgb.txt").is_file()
+    (tmp_path / "demo" / "letter.txt").unlink()
+    demo.make_way(tmp_path / "demo", overwrite=True)
+    assert list((tmp_path / "demo").iterdir()) == []
+
+
+def test_a_reader_may_have_seen_enough():
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(line("presets", "default"), stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (0, "")
