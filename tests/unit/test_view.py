@@ -7,6 +7,7 @@ import torch
 from analytic_room import CAMERA, Room, pose
 
 from tcgsplat.geometry import se3
+from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.protocol import MAX_OPACITY, Raster, Rasterizer, Splats
 from tcgsplat.render.reference import ReferenceRasterizer
 from tcgsplat.render.view import MIN_COVERAGE, Rendering, render, render_view
@@ -92,9 +93,9 @@ class Recorder:
     def __init__(self) -> None:
         self.splats: list[Splats] = []
 
-    def __call__(self, splats: Splats, camera: object, T_cam_map: torch.Tensor) -> Raster:
+    def __call__(self, splats: Splats, camera: Camera, T_cam_map: torch.Tensor) -> Raster:
         self.splats.append(splats)
-        return ReferenceRasterizer()(splats, CAMERA, T_cam_map)
+        return ReferenceRasterizer()(splats, camera, T_cam_map)
 
 
 def one(sh_degree: int = 0) -> Gaussians:
