@@ -193,11 +193,12 @@ def test_the_ground_truth_plays_no_part_in_a_run(
     assert "no ground truth" in said.out if poison == "absent" else "groundtruth.txt" in said.err
 
 
-def started(*arguments: str | Path, submaps: Path) -> subprocess.Popen[str]:
-    """A run that has sealed a submap and is still going."""
+def started(room: Path, out: Path) -> subprocess.Popen[str]:
+    """A run that has sealed a submap, has written the path so far, and is still going."""
+    arguments = ("run", room, *SHORT_SUBMAPS, *SLOW, "--out", out)
     process = subprocess.Popen(line(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + PATIENCE
-    while not (submaps / "0000.npz").exists():
+    while not (out / "trajectory.txt").exists():
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
         time.sleep(0.005)
     assert process.poll() is None
@@ -206,7 +207,7 @@ def started(*arguments: str | Path, submaps: Path) -> subprocess.Popen[str]:
 
 def test_a_killed_run_loses_no_sealed_submap(room_folder: Path, tmp_path: Path):
     out = tmp_path / "killed"
-    process = started("run", room_folder, *SHORT_SUBMAPS, *SLOW, "--out", out, submaps=out / "submaps")
+    process = started(room_folder, out)
     process.kill()
     process.communicate()
     assert process.returncode == -signal.SIGKILL
@@ -221,7 +222,7 @@ def test_a_killed_run_loses_no_sealed_submap(room_folder: Path, tmp_path: Path):
 
 def test_ctrl_c_saves_what_there_is(room_folder: Path, tmp_path: Path):
     out = tmp_path / "stopped"
-    process = started("run", room_folder, *SHORT_SUBMAPS, *SLOW, "--out", out, submaps=out / "submaps")
+    process = started(room_folder, out)
     process.send_signal(signal.SIGINT)
     said, complaints = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130 and said == ""
@@ -289,9 +290,11 @@ def test_demo_makes_everything_that_it_shows(tmp_path: Path, capsys: pytest.Capt
     assert list((tmp_path / "demo").iterdir()) == []
 
 
-def test_a_reader_may_have_seen_enough():
+@pytest.mark.parametrize("arguments", [("presets",), ("presets", "default")])  # less and more than a buffer
+def test_a_reader_may_have_seen_enough(arguments: tuple[str, ...]):
     reading, writing = os.pipe()
     os.close(reading)
-    done = subprocess.run(line("presets", "default"), stdout=writing, stderr=subprocess.PIPE, text=True)
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    done = subprocess.run(line(*arguments), stdout=writing, stderr=subprocess.PIPE, text=True, env=buffered)
     os.close(writing)
     assert (done.returncode, done.stderr) == (0, "")

@@ -132,7 +132,7 @@ class NumbaRasterizer:
 
     name = "numba"
 
-    def __init__(self, threads: int | None = None, lap: Callable[[str], object] = lambda stage: None) -> None:
+    def __init__(self, threads: int | None = None, lap: Callable[[str], object] = lambda _: None) -> None:
         """A rasterizer on the CPU.
 
         Args:
