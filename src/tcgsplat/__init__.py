@@ -4,7 +4,7 @@ The public names below are imported when first used, so that `import tcgsplat` a
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from tcgsplat.config import SlamConfig
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = ["Slam", "SlamConfig", "__version__", "evaluate", "open_rasterizer", "open_sequence"]
 
-_HOME = {
+_HOME: Final = {
     "Slam": "tcgsplat.slam",
     "SlamConfig": "tcgsplat.config",
     "evaluate": "tcgsplat.evaluation.report",

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -115,10 +115,11 @@ def run(tmp_path: Path, rasterizer: Rasterizer) -> RunDirectory:
             frame_index = 4 * index + i
             rows.append(TrackedPose(frame_index, 100.0 + frame_index / 30, index, T_map_cam, lost=frame_index == 7))
             if i % 2 == 0:
-                submap = submap.with_keyframe(seen(submap, frame_index, T_map_cam, rasterizer))
+                keyframe = seen(submap, frame_index, T_map_cam, rasterizer)
+                submap = replace(submap, keyframes=(*submap.keyframes, keyframe))
         run.write_submap(submap)
     run.write_trajectory(Trajectory(tuple(rows)), atlas)
-    run.write_summary({"frames": 8, "seconds": 2.0, "peak_rss_mb": 512.5, "stage_ms": {"track": 1.0}})
+    run.write_summary({"frames": 8, "ms_per_frame": 250.0, "peak_rss_mb": 512.5, "stage_ms": {"track": 1.0}})
     return run
 
 

@@ -209,9 +209,13 @@ def test_moving_gaussians_moves_centres_and_covariances(generator: torch.Generat
     assert torch.equal(moved.ids, gaussians.ids)
 
 
-def test_view_dependent_gaussians_refuse_to_turn(generator: torch.Generator) -> None:
-    with pytest.raises(ValueError, match="harmonics would have to turn"):
-        some_gaussians(3, 1, generator).transformed(se3.identity())
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_colour_turns_with_the_gaussians(degree: int, generator: torch.Generator) -> None:
+    gaussians = some_gaussians(20, degree, generator)
+    T = se3.exp(row(1, -2, 0.5, 0.3, -2.0, 1.0))
+    viewpoint = torch.tensor([0.4, -3.0, 1.5])
+    seen_from_there = gaussians.transformed(T).colors(se3.transform(T, viewpoint[None])[0])
+    torch.testing.assert_close(seen_from_there, gaussians.colors(viewpoint), atol=2e-5, rtol=1e-4)
 
 
 def test_growing_and_pruning_keep_rows_whole(generator: torch.Generator) -> None:

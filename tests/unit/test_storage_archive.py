@@ -98,13 +98,14 @@ def test_sensor_depth_comes_back_exactly(tmp_path: Path, generator: torch.Genera
     keyframe = random_keyframe(0, generator)
     depth = torch.randint(0, 13 * units, (24, 32), generator=generator).to(torch.float32) / units
     keyframe = Keyframe(dataclasses.replace(keyframe.frame, depth=depth), keyframe.T_map_cam)
-    submap = Submap.anchored(se3.identity(), index=0).with_keyframe(keyframe)
+    submap = dataclasses.replace(Submap.anchored(se3.identity(), index=0), keyframes=(keyframe,))
     archive.write_submap(tmp_path / "a.npz", submap)
     assert torch.equal(archive.read_submap(tmp_path / "a.npz").keyframes[0].frame.depth, depth)
 
 
 def test_far_depth_takes_a_coarser_scale_and_does_not_clip(tmp_path: Path, generator: torch.Generator) -> None:
-    submap = Submap.anchored(se3.identity(), index=0).with_keyframe(random_keyframe(0, generator, farthest=40.0))
+    far = random_keyframe(0, generator, farthest=40.0)
+    submap = dataclasses.replace(Submap.anchored(se3.identity(), index=0), keyframes=(far,))
     archive.write_submap(tmp_path / "a.npz", submap)
     depth = archive.read_submap(tmp_path / "a.npz").keyframes[0].frame.depth
     assert depth.max().item() == pytest.approx(40.0, abs=1e-5)

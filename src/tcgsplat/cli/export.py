@@ -55,16 +55,11 @@ def world_map(run: RunDirectory) -> tuple[Gaussians, PerGaussian]:
     """The Gaussians of all sealed submaps in the world frame, and the confidence of each.
 
     Raises:
-        ArchiveError: if there is no sealed submap, one is damaged, or its colour depends on the view.
+        ArchiveError: if there is no sealed submap, or one is damaged.
     """
     parts, confidences = [], []
     for index in range(run.submap_count):
         submap = run.load_submap(index)
-        if submap.gaussians.sh_degree > 0:
-            raise ArchiveError(
-                f"the colours in {run.path} depend on the view, and cannot be turned into the world frame; "
-                "run with --mapper.sh_degree 0 to export a map"
-            )
         parts.append(submap.gaussians.transformed(submap.T_world_map))
         confidences.append(submap.confidence.value)
     if not parts:

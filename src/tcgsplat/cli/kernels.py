@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Final
 
 import torch
 from numba.core import event
@@ -13,7 +14,7 @@ from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.frame import Frame
 from tcgsplat.slam import Slam
 
-_ONE_STEP = {
+_ONE_STEP: Final = {
     "tracker.descent.iterations": 1,
     "mapper.iterations": 1,
     "mapper.first_iterations": 1,

@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from tcgsplat.datasets.association import matrices_by_row, paired_by_number, read_text
 from tcgsplat.datasets.calibration import read_calibration
@@ -15,7 +16,7 @@ from tcgsplat.errors import DatasetError
 CAMERA: Mapping[str, object] = {
     "width": 1200, "height": 680, "fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "depth_scale": 6553.5,
 }  # fmt: skip
-KEYS = {"w": "width", "h": "height", "fx": "fx", "fy": "fy", "cx": "cx", "cy": "cy", "scale": "depth_scale"}
+KEYS: Final = {"w": "width", "h": "height", "fx": "fx", "fy": "fy", "cx": "cx", "cy": "cy", "scale": "depth_scale"}
 """Names in `cam_params.json`, and ours."""
 
 

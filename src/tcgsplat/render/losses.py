@@ -33,14 +33,14 @@ class _CpuBlur(torch.autograd.Function):
     """Separable blur by OpenCV, twenty times faster here than torch's convolution; symmetric, so its own adjoint."""
 
     @staticmethod
-    def forward(ctx: Any, images: Tensor) -> Tensor:  # noqa: ARG004, D102
+    def forward(ctx: Any, images: Tensor) -> Tensor:  # noqa: ARG004
         window = _window().numpy()
         border = cv2.BORDER_CONSTANT
         blurred = cv2.sepFilter2D(images.detach().contiguous().numpy(), -1, window, window, borderType=border)
         return torch.from_numpy(blurred.reshape(images.shape))
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # noqa: ARG004, D102
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # noqa: ARG004
         return _CpuBlur.forward(None, gradient)
 
 

@@ -51,6 +51,22 @@ def sh_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n 
     return torch.stack(basis, dim=-1)
 
 
+def sh_rotation(R_b_a: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "k k"]:
+    """Matrix that turns harmonic coefficients of frame a into those of frame b, float64.
+
+    Colour must stay the same along every physical direction: basis(d_b) sh_b = basis(R^T d_b) sh_a. The harmonics of
+    one degree span a space that rotations map onto itself, so solving this over more directions than coefficients,
+    well spread on the sphere (Fibonacci's lattice), is exact.
+    """
+    k = torch.arange(64, dtype=torch.float64) + 0.5
+    z, turn = 1 - k / 32, k * math.pi * (3 - math.sqrt(5))
+    radius = (1 - z * z).sqrt()
+    directions_b = torch.stack((radius * turn.cos(), radius * turn.sin(), z), dim=-1)
+    directions_a = directions_b @ R_b_a.to(torch.float64)
+    solved: Tensor = torch.linalg.lstsq(sh_basis(directions_b, degree), sh_basis(directions_a, degree)).solution
+    return solved
+
+
 @dataclass(frozen=True)
 class Gaussians:
     """A set of anisotropic Gaussians in the frame of their submap (Eq. 1), as raw, optimisable parameters."""
@@ -124,19 +140,15 @@ class Gaussians:
         return Gaussians(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
     def transformed(self, T_b_a: Float[Tensor, "4 4"]) -> "Gaussians":
-        """The same Gaussians in frame b, given here in frame a. Degree 0 colour only: higher degrees turn with it.
-
-        Raises:
-            ValueError: if the colour has a degree above 0.
-        """
-        if self.sh_degree > 0:
-            raise ValueError(
-                "Gaussians with view-dependent colour cannot be rotated: their harmonics would have to turn"
-            )
+        """The same Gaussians in frame b, given here in frame a; view-dependent colour turns along."""
         T = T_b_a.to(self.means)
         q = quaternion.from_matrix(T[:3, :3])
+        sh = self.sh
+        if self.sh_degree > 0:
+            sh = torch.einsum("jk,nkc->njc", sh_rotation(T_b_a[:3, :3], self.sh_degree).to(sh), sh)
         return replace(
             self,
             means=self.means @ T[:3, :3].T + T[:3, 3],
             quats=quaternion.multiply(q.expand_as(self.quats), self.quats),
+            sh=sh,
         )

@@ -7,6 +7,7 @@ which viewers that do not know it skip.
 """
 
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from tcgsplat.scene.gaussians import MAX_SH_DEGREE, Gaussians
 from tcgsplat.storage import atomic
 from tcgsplat.tensors import PerGaussian
 
-_TYPES = {
+_TYPES: Final = {
     "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4", "float": "<f4",
     "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4",
     "float32": "<f4", "float64": "<f8",

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.view import Rendering
@@ -44,6 +45,15 @@ class AlignmentConfig:
     """Depth noise at 0.4 m, metres: a structured-light sensor's (Nguyen et al. 2012) and some for the map. [ours]"""
     sigma_slope: float = 0.0019
     """Growth of depth noise with the square of the distance beyond 0.4 m, 1/metre. [ours]"""
+
+    def __post_init__(self) -> None:
+        if not self.iterations or min(self.iterations) < 0 or sum(self.iterations) == 0:
+            raise ConfigError(
+                f"tracker.alignment.iterations is {self.iterations!r}; give passes for every level, finest first, "
+                "such as [3, 2, 3]"
+            )
+        if self.stride < 1:
+            raise ConfigError(f"tracker.alignment.stride is {self.stride!r}; it must be at least 1")
 
 
 @dataclass(frozen=True)

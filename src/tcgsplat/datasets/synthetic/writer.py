@@ -2,7 +2,7 @@
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ Array = np.ndarray[Any, np.dtype[Any]]
 
 Layout = Literal["tum", "replica"]
 
-DEPTH_SCALE: dict[Layout, float] = {"tum": 5000.0, "replica": 6553.5}
+DEPTH_SCALE: Mapping[Layout, float] = {"tum": 5000.0, "replica": 6553.5}
 """Units of the 16-bit depth images per metre."""
 
 

@@ -10,7 +10,7 @@ lanes), loads and stores on flat float32 arrays, comparisons as 16-bit masks, ex
 
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from llvmlite import ir
@@ -27,7 +27,7 @@ _VF, _VI, _VB = ir.VectorType(_F32, LANES), ir.VectorType(_I32, LANES), ir.Vecto
 
 # Contraction to fused multiply-adds and reciprocals, but no reassociation: exp2's rounding trick must survive.
 _FLAGS = ("contract", "nsz", "arcp")
-MATH = {"contract", "nsz", "arcp"}
+MATH: Final = {"contract", "nsz", "arcp"}
 """The `fastmath` argument of every kernel, for the same reason."""
 
 
