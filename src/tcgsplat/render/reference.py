@@ -60,7 +60,7 @@ def project(splats: Splats, camera: Camera, T_cam_map: Pose) -> Projected:
     zero, one = torch.zeros_like(z), torch.ones_like(z)
     duvz_dcam = torch.stack(
         (camera.fx / z, zero, -camera.fx * a / z, zero, camera.fy / z, -camera.fy * b / z, zero, zero, one), dim=-1
-    ).unflatten(-1, (3, 3))
+    ).reshape(-1, 3, 3)
 
     M = duvz_dcam @ R @ (quaternion.to_matrix(splats.quats) * splats.scales[:, None, :])
     covariance_uvz = M @ M.transpose(-1, -2)
