@@ -209,36 +209,55 @@ def backward(tile_from, tile_to, tile_ends, pair_splats, records, tiles_x, grid,
 @njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
 def gather_sums(start, stop, first, slot_starts, slot_pairs, masks, pair_sums, sums):
     """Each splat's pairs summed in the order of its tiles: the same bits whatever threads made the pairs."""
+    last = np.int64(slot_starts[stop])
+    for slot in range(slot_starts[start], min(last, np.int64(slot_starts[start]) + _AHEAD)):
+        prefetch(pair_sums, np.int64(slot_pairs[slot]) * RECORD)
     for i in range(start, stop):
         total = spread(np.float32(0))
         for slot in range(slot_starts[i], slot_starts[i + 1]):
+            prefetch(pair_sums, np.int64(slot_pairs[min(slot + _AHEAD, last - 1)]) * RECORD)
             pair = np.int64(slot_pairs[slot])
             if masks[pair] != 0:
                 total = total + load(pair_sums, pair * RECORD)
         store(sums, (i - first) * RECORD, total)
 
 
-@njit(nogil=True, cache=True)
-def to_planes(tile_from, tile_to, tiles_x, width, height, image, planes):
-    """Tile layout to [CHANNELS, height, width]."""
+@njit(error_model="numpy", nogil=True, cache=True)
+def to_planes(tile_from, tile_to, tiles_x, width, height, image, planes):  # type: ignore[no-untyped-def]
+    """Tile layout to [CHANNELS, height, width], four pixels of a block's row at a time."""
     for tile in range(tile_from, tile_to):
         x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        columns, rows = min(TILE, width - x0), min(TILE, height - y0)
         for channel in range(CHANNELS):
             base = tile * TILE_FLOATS + channel * 256
-            for y in range(min(TILE, height - y0)):
-                for x in range(min(TILE, width - x0)):
-                    planes[channel, y0 + y, x0 + x] = image[base + (y // 4 * 4 + x // 4) * 16 + (y % 4) * 4 + x % 4]
+            for y in range(rows):
+                row, out = base + (y >> 2) * 64 + (y & 3) * 4, planes[channel, y0 + y]
+                if columns == TILE:
+                    for block in range(4):
+                        for x in range(4):
+                            out[x0 + block * 4 + x] = image[row + block * 16 + x]
+                else:
+                    for x in range(columns):
+                        out[x0 + x] = image[row + (x >> 2) * 16 + (x & 3)]
 
 
-@njit(nogil=True, cache=True)
-def to_tiles(tile_from, tile_to, tiles_x, width, height, planes, image):
+@njit(error_model="numpy", nogil=True, cache=True)
+def to_tiles(tile_from, tile_to, tiles_x, width, height, planes, image):  # type: ignore[no-untyped-def]
     """[CHANNELS, height, width] to tile layout; pixels of a tile that hang over the image's edge become 0."""
     for tile in range(tile_from, tile_to):
         x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        columns, rows = min(TILE, width - x0), min(TILE, height - y0)
         for channel in range(CHANNELS):
             base = tile * TILE_FLOATS + channel * 256
-            for y in range(TILE):
-                for x in range(TILE):
-                    inside = y0 + y < height and x0 + x < width
-                    value = planes[channel, y0 + y, x0 + x] if inside else np.float32(0)
-                    image[base + (y // 4 * 4 + x // 4) * 16 + (y % 4) * 4 + x % 4] = value
+            if columns < TILE or rows < TILE:
+                for k in range(256):
+                    image[base + k] = np.float32(0)
+            for y in range(rows):
+                row, source = base + (y >> 2) * 64 + (y & 3) * 4, planes[channel, y0 + y]
+                if columns == TILE:
+                    for block in range(4):
+                        for x in range(4):
+                            image[row + block * 16 + x] = source[x0 + block * 4 + x]
+                else:
+                    for x in range(columns):
+                        image[row + (x >> 2) * 16 + (x & 3)] = source[x0 + x]
