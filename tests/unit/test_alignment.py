@@ -243,11 +243,22 @@ def test_colour_alone_is_enough_where_there_is_no_depth(room: Room) -> None:
     assert errors(found.T_map_cam, T_NEAR)[0] < 3
 
 
-def test_depth_alone_is_enough_where_there_is_no_texture() -> None:
+@pytest.mark.parametrize("T_true", [T_NEAR, se3.inverse(T_NEAR), pose(0.02, 0.02, degrees=(0, 1, 1))])
+def test_depth_alone_is_enough_where_there_is_no_texture(T_true: Pose) -> None:
     grey = Room(contrast=0.0)
-    found = aligned(grey.frame(T_NEAR), grey.frame())
-    assert errors(found.T_map_cam, T_NEAR)[0] < 1.5
+    found = aligned(grey.frame(T_true), grey.frame())
+    assert errors(found.T_map_cam, T_true)[0] < 1.5
     assert found.correlation > 0.9  # two flat pictures agree
+
+
+def test_what_a_flat_wall_leaves_open_stays_put() -> None:
+    """A grey wall tells its distance and two angles; along itself the camera must not be thrown about."""
+    facing_a_wall = Room(low=(-9.0, -9.0, -9.0), high=(9.0, 9.0, 1.5), contrast=0.0, T_room_world=se3.identity())
+    found = aligned(facing_a_wall.frame(pose(0, 0, 0.02, degrees=(1, -1, 0))), facing_a_wall.frame())
+    sideways, (_, _, z) = found.T_map_cam[:2, 3], found.T_map_cam[:3, 3].tolist()
+    assert z == pytest.approx(0.02, abs=1e-3)
+    assert sideways.norm() < 0.005
+    assert errors(found.T_map_cam, pose(0, 0, 0.02, degrees=(1, -1, 0)))[1] < 0.2
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(0.75, 0.1), (1.3, -0.1), (1.0, 0.2)])
@@ -306,6 +317,21 @@ def test_what_the_map_does_not_cover_gives_no_points(room: Room) -> None:
     half = align(room.frame(T_NEAR), holed, EVERYWHERE, se3.identity(), CONFIG)
     assert errors(full.T_map_cam, T_NEAR)[0] < 1
     assert errors(half.T_map_cam, T_NEAR)[0] < 2.5
+
+
+def test_thin_coverage_gives_no_points(room: Room) -> None:
+    """What is covered by less than `min_alpha` is more a guess than a surface."""
+    frame = room.frame()
+    thin = torch.zeros_like(frame.valid)
+    thin[:, 40:] = True
+    wrong = replace(frame, depth=torch.where(thin, frame.depth - 0.03, frame.depth))
+    view = rendering_of(wrong, alpha=torch.where(thin, 0.6, 0.99))
+    strict, lax = (
+        align(room.frame(T_NEAR), view, EVERYWHERE, se3.identity(), replace(CONFIG, min_alpha=limit))
+        for limit in (0.7, 0.5)
+    )
+    assert errors(strict.T_map_cam, T_NEAR)[0] < 2.5
+    assert errors(lax.T_map_cam, T_NEAR)[0] > 5
 
 
 def shifted_patch(frame: Frame) -> Frame:
