@@ -369,6 +369,17 @@ def maturity(confidence: PerGaussian, age: Real[Tensor, " n"], *, maturity_time:
     return confidence * (1.0 - torch.exp(-age.to(confidence).clamp_min(0.0) / maturity_time))
 
 
+def allowed_change(maturity: PerGaussian, *, slack_min: float, slack_max: float) -> PerGaussian:
+    r"""Abnormal change that costs nothing: $\delta_{max} - \kappa (\delta_{max} - \delta_{min})$, metres.
+
+    Args:
+        maturity: $\kappa$, in [0, 1].
+        slack_min: $\delta_{min}$, metres, allowed to the fully mature.
+        slack_max: $\delta_{max}$, metres, allowed to the new and the doubtful.
+    """
+    return slack_max - maturity * (slack_max - slack_min)
+
+
 def stability_loss(
     abnormal: PerGaussian,
     maturity: PerGaussian,
@@ -397,8 +408,8 @@ def stability_loss(
     Returns:
         A loss that is zero, and has a zero gradient, when nothing is counted or nothing moves.
     """
-    slack = slack_max - maturity * (slack_max - slack_min)
-    total = weight * torch.relu(abnormal - slack)[counted].sum()
+    allowed = allowed_change(maturity, slack_min=slack_min, slack_max=slack_max)
+    total = weight * torch.relu(abnormal - allowed)[counted].sum()
     return total / counted.sum().clamp_min(1) if reduction == "mean" else total
 
 

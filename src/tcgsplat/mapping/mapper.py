@@ -171,15 +171,25 @@ class Mapper:
         """Eq. 23 over the visible Gaussians that existed before this update and have a baseline."""
         config, state = self._confidence, submap.confidence
         counted = visible & (state.born < submap.clock) & state.has_baseline
-        return eq.stability_loss(
-            eq.abnormal_change(self_distance(gaussians, before, config), state.baseline),
-            eq.maturity(state.value, submap.clock - state.born, maturity_time=config.maturity_time),
-            counted,
+        maturity = eq.maturity(state.value, submap.clock - state.born, maturity_time=config.maturity_time)
+        # A Gaussian that has not used up its slack adds nothing, neither loss nor gradient, and most have not: only
+        # the others are differentiated.
+        with torch.no_grad():
+            change = self_distance(gaussians, before, config) - state.baseline
+            allowed = eq.allowed_change(maturity, slack_min=config.slack_min, slack_max=config.slack_max)
+            rows = (counted & (change > allowed)).nonzero().flatten()
+        loss = eq.stability_loss(
+            eq.abnormal_change(
+                self_distance(gaussians.picked(rows), before.picked(rows), config), state.baseline[rows]
+            ),
+            maturity[rows],
+            counted[rows],
             weight=config.stability_weight,
             slack_min=config.slack_min,
             slack_max=config.slack_max,
-            reduction=config.stability_reduction,
+            reduction="sum",
         )
+        return loss / counted.sum().clamp_min(1) if config.stability_reduction == "mean" else loss
 
     def _step_scale(self, submap: Submap) -> PerGaussian | None:
         """Eq. 24, or nothing where confidence does not guide mapping."""

@@ -2,15 +2,16 @@
 
 from typing import Any
 
-import cv2
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tcgsplat.render import ssim_kernels
 from tcgsplat.tensors import Image, Plane
 
 _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
-_SSIM_RADIUS, _SSIM_SIGMA = 5, 1.5
+_SSIM_RADIUS, _SSIM_SIGMA = ssim_kernels.RADIUS, 1.5
 
 
 def color_error(rendered: Image, observed: Image) -> Plane:
@@ -29,26 +30,28 @@ def _window(dtype: torch.dtype = torch.float32) -> Float[Tensor, " k"]:
     return (window / window.sum()).to(dtype)
 
 
-class _CpuBlur(torch.autograd.Function):
-    """Separable blur by OpenCV, twenty times faster here than torch's convolution; symmetric, so its own adjoint."""
+class _CpuSsim(torch.autograd.Function):
+    """The map by the kernels; its derivative by `rendered` alone, since the observed image is data."""
 
     @staticmethod
-    def forward(ctx: Any, images: Tensor) -> Tensor:  # noqa: ARG004
+    def forward(ctx: Any, rendered: Tensor, observed: Tensor) -> Tensor:
+        a, b = (np.ascontiguousarray(x.detach().permute(2, 0, 1).numpy()) for x in (rendered, observed))
         window = _window().numpy()
-        border = cv2.BORDER_CONSTANT
-        blurred = cv2.sepFilter2D(images.detach().contiguous().numpy(), -1, window, window, borderType=border)
-        return torch.from_numpy(blurred.reshape(images.shape))
+        similarity, *partials = (np.empty_like(a) for _ in range(4))
+        ssim_kernels.forward(a, b, window, np.float32(_SSIM_C1), np.float32(_SSIM_C2), similarity, *partials)
+        ctx.inputs = a, b, partials, window
+        return torch.from_numpy(similarity).permute(1, 2, 0)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # noqa: ARG004
-        return _CpuBlur.forward(None, gradient)
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        a, b, partials, window = ctx.inputs
+        upstream, out = np.ascontiguousarray(gradient.permute(2, 0, 1).numpy()), np.empty_like(a)
+        ssim_kernels.backward(upstream, a, b, *partials, window, out)  # type: ignore[call-arg]
+        return torch.from_numpy(out).permute(1, 2, 0), None
 
 
 def _blurred(images: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
     """Gaussian window of 11 pixels and sigma 1.5, zeros beyond the border."""
-    if images.device.type == "cpu" and images.dtype == torch.float32:
-        blurred: Tensor = _CpuBlur.apply(images)  # type: ignore[no-untyped-call]
-        return blurred
     window = _window(images.dtype).to(images.device)
     planes = images.permute(2, 0, 1)[:, None]
     across = torch.nn.functional.conv2d(planes, window[None, None, None, :], padding=(0, _SSIM_RADIUS))
@@ -57,8 +60,14 @@ def _blurred(images: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
 
 
 def ssim_map(rendered: Image, observed: Image) -> Float[Tensor, "h w 3"]:
-    """Structural similarity at every pixel and channel, in [-1, 1] (Wang et al. 2004), differentiable."""
+    """Structural similarity at every pixel and channel, in [-1, 1] (Wang et al. 2004), differentiable by `rendered`.
+
+    On the CPU in float32 by kernels of its own, thirty times faster than the same in torch; else in torch.
+    """
     a, b = rendered, observed
+    if a.device.type == "cpu" and a.dtype == torch.float32:
+        similarity: Tensor = _CpuSsim.apply(a, b)  # type: ignore[no-untyped-call]
+        return similarity
     mean_a, mean_b, aa, bb, ab = _blurred(torch.cat((a, b, a * a, b * b, a * b), dim=-1)).chunk(5, dim=-1)
     var_a, var_b, cov = aa - mean_a * mean_a, bb - mean_b * mean_b, ab - mean_a * mean_b
     structure = (2 * cov + _SSIM_C2) / (var_a + var_b + _SSIM_C2)

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tcgsplat.geometry import quaternion
@@ -134,6 +134,10 @@ class Gaussians:
     def kept(self, keep: PerGaussianFlag) -> "Gaussians":
         """Only the flagged rows, in their order."""
         return Gaussians(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+    def picked(self, rows: Int[Tensor, " m"]) -> "Gaussians":
+        """The rows of the given places."""
+        return Gaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def to(self, device: torch.device) -> "Gaussians":
         """The same Gaussians on another device."""
