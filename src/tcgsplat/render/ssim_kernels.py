@@ -5,12 +5,14 @@ Its three partial derivatives, spread back by the same symmetric window, give
     dL/da = blur(G dS/dm_a) + 2 a blur(G dS/dE[aa]) + b blur(G dS/dE[ab]).
 """
 
+from typing import Final
+
 import numpy as np
 from numba import njit
 
 RADIUS = 5
 _TWO = np.float32(2)
-_FAST = {"contract", "nsz", "arcp", "reassoc"}
+_FAST: Final = {"contract", "nsz", "arcp", "reassoc"}
 
 
 @njit(fastmath=_FAST, error_model="numpy", nogil=True, cache=True)
