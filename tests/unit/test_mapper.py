@@ -291,12 +291,15 @@ class TestGuidance:
         newborn = replace(aged, confidence=replace(aged.confidence, born=torch.full_like(aged.confidence.born, 100)))
         fresh = replace(aged, confidence=replace(aged.confidence, updates=torch.zeros_like(aged.confidence.updates)))
 
-        def distance(submap: Submap, weight: float) -> float:
-            config = replace(strict, stability_weight=weight)
+        def distance(submap: Submap, weight: float, **changes: object) -> float:
+            config = replace(strict, stability_weight=weight, **changes)  # type: ignore[arg-type]
             update = mapped(rasterizer, submap, frame, confidence=config, iterations=10, min_opacity=0.0)
             return float(self_distance(update.submap.gaussians, update.before, config).mean())
 
         assert distance(aged, 10.0) < 0.6 * distance(aged, 0.0)
+        seen = int(render_view(aged, CAMERA, se3.identity(), rasterizer).visible.sum())
+        mean = distance(aged, 10.0 * seen, stability_reduction="mean")  # over all in view, not only over who moved
+        assert mean == pytest.approx(distance(aged, 10.0), rel=1e-3)
         assert distance(newborn, 10.0) == pytest.approx(distance(newborn, 0.0), rel=1e-6)
         assert distance(fresh, 10.0) == pytest.approx(distance(fresh, 0.0), rel=1e-6)
 
