@@ -130,7 +130,7 @@ class TestKernels:
         ("depth", "in_view", "agreeing", "counted"),
         [
             (1.5, 1, 1, True),  # the surface itself
-            (0.0, 1, 1, True),  # no reading: colour alone
+            (0.0, 1, 0, True),  # no reading: colour alone, and nothing to agree with
             (-1.0, 0, 0, False),  # the camera saw nothing of the world here
             (1.2, 1, 0, False),  # hidden by something in front
             (1.8, 1, 0, False),  # gone

@@ -18,10 +18,10 @@ changes = st.fixed_dictionaries(
     optional={
         "tracker.solver": st.sampled_from(["alignment", "descent"]),
         "tracker.alignment.iterations": st.lists(st.integers(1, 9), min_size=1, max_size=5).map(tuple),
-        "tracker.alignment.gate": any_float,
+        "tracker.alignment.gate": positive,
         "tracker.descent.soft_alpha": st.booleans(),
-        "tracker.max_step": any_float,
-        "mapper.isotropy_weight": any_float,
+        "tracker.max_step": positive,
+        "mapper.isotropy_weight": positive,
         "mapper.rates.means": any_float,
         "mapper.seeding.push_back": any_float,
         "schedule.submap_distance": positive,

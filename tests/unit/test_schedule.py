@@ -6,20 +6,36 @@ import pytest
 import torch
 from analytic_room import Room, pose
 
+from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.schedule import Schedule, ScheduleConfig
+from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
 
 MOTION = ScheduleConfig(map_every=4, submap_by="motion", submap_distance=0.5, submap_angle=50.0)
 INTERVAL = ScheduleConfig(map_every=4, submap_by="interval", submap_interval=30)
 EMPTY = Submap.anchored(se3.identity(), index=0)
 HERE = se3.identity()
+ONE = Gaussians(
+    ids=torch.zeros(1, dtype=torch.int64),
+    means=torch.zeros(1, 3),
+    log_scales=torch.zeros(1, 3),
+    quats=torch.ones(1, 4),
+    logit_opacities=torch.zeros(1),
+    sh=torch.zeros(1, 1, 3),
+)
 
 
 def submap(*mapped: int) -> Submap:
     frames = [Room().frame(index=index) for index in mapped]
-    return replace(EMPTY, keyframes=tuple(Keyframe(frame, se3.identity()) for frame in frames))
+    keyframes = tuple(Keyframe(frame, se3.identity()) for frame in frames)
+    return replace(EMPTY.grown(ONE, ConfidenceConfig()), keyframes=keyframes)
+
+
+def test_a_submap_that_lost_all_its_gaussians_is_mapped_at_once() -> None:
+    assert not Schedule(MOTION).maps(1, submap(0))
+    assert Schedule(MOTION).maps(1, replace(submap(0), gaussians=Gaussians.empty()))
 
 
 @pytest.mark.parametrize("config", [MOTION, INTERVAL])

@@ -57,6 +57,12 @@ class MapperConfig:
             raise ConfigError(f"mapper.sh_degree is {self.sh_degree!r}; it must be 0, 1, 2 or 3")
         if self.iterations < 1 or self.first_iterations < 1:
             raise ConfigError("mapper.iterations and mapper.first_iterations must be at least 1")
+        for name in ("current_share", "min_opacity", "frozen_color_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"mapper.{name} is {getattr(self, name)!r}; it must be between 0 and 1")
+        for name in ("color_weight", "depth_weight", "ssim_weight", "isotropy_weight", "max_keyframes"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"mapper.{name} is {getattr(self, name)!r}; it must be at least 0")
 
 
 @dataclass(frozen=True)
@@ -151,12 +157,13 @@ class Mapper:
         measured = frame.valid & (frame.depth > 0)
         pixels = max(int(measured.sum()), 1)
         weight = eq.mapping_weight(rendering.confidence) if guided else torch.ones_like(rendering.alpha)
-        ssim = torch.where(frame.valid[..., None], ssim_map(rendering.color, frame.color), 1.0)
+        # Where the picture saw nothing, the rendering is compared with itself, so that no window sees a false edge.
+        seen = torch.where(frame.valid[..., None], rendering.color, frame.color)
         return eq.mapping_loss(
             weight,
             color_error(rendering.color, frame.color) * measured,
             depth_error(rendering.depth_as(config.depth_mode), frame.depth) * measured,
-            1.0 - ssim.mean(),
+            1.0 - ssim_map(seen, frame.color).mean(),
             isotropy_error(gaussians.scales) if config.isotropy_weight > 0 else torch.zeros(()),
             self._stability(gaussians, before, submap, rendering.visible) if guided else torch.zeros(()),
             color_weight=config.color_weight / pixels,

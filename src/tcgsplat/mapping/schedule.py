@@ -49,7 +49,7 @@ class Schedule:
         return far or math.degrees(se3.rotation_angle(T_map_cam)) > self.config.submap_angle
 
     def maps(self, frame_index: int, submap: Submap) -> bool:
-        """Whether this frame is mapped: every `map_every` frames since the last one that was."""
-        if not submap.keyframes:
+        """Whether this frame is mapped: `map_every` frames after the last one that was, or at once if all is gone."""
+        if not submap.keyframes or len(submap) == 0:
             return True
         return frame_index - submap.keyframes[-1].frame.index >= self.config.map_every

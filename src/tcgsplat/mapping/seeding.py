@@ -60,6 +60,9 @@ class SeedingConfig:
             raise ConfigError(f"seeding.recipe is {self.recipe!r}; choose surface or points")
         if self.spacing not in (1, 2, 4):
             raise ConfigError(f"seeding.spacing is {self.spacing!r}; choose 1, 2 or 4")
+        for name in ("footprint", "flatness", "behind"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"seeding.{name} is {getattr(self, name)!r}; it must be above 0")
         if not 0 < self.opacity < 1:
             raise ConfigError(f"seeding.opacity is {self.opacity!r}; it must be above 0 and below 1")
 

@@ -23,6 +23,10 @@ from tcgsplat.tracking import alignment_kernels as kernels
 
 Floats = npt.NDArray[np.float32]
 
+_ENOUGH_FOR_EXPOSURE = 100.0
+"""Sum of weights below which gain and offset are left alone: about as many points."""
+_FLAT_VARIANCE = 0.002
+"""Variance of intensity, grey levels squared, that a gain of 1 is worth: an image flatter than that keeps it."""
 _STEP_PRIOR = 0.05
 """Spread of a step that is expected before anything is seen, metres and radians."""
 
@@ -54,6 +58,12 @@ class AlignmentConfig:
             )
         if self.stride < 1:
             raise ConfigError(f"tracker.alignment.stride is {self.stride!r}; it must be at least 1")
+        for name in ("gate", "sigma_floor"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"tracker.alignment.{name} is {getattr(self, name)!r}; it must be above 0 metres")
+        for name in ("depth_weight", "sigma_slope"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"tracker.alignment.{name} is {getattr(self, name)!r}; it must be at least 0")
 
 
 @dataclass(frozen=True)
@@ -69,7 +79,7 @@ class Alignment:
     overlap: float
     """Share of the rendered view that falls into the live image."""
     agreement: float
-    """Share of that overlap whose depth agrees within the gate."""
+    """Share of the overlap's depth readings that agree within the gate; 1 where there is none to ask."""
     correlation: float
     """Of live and rendered intensity where the depth does not disagree, in [-1, 1]; does not feel the exposure."""
 
@@ -108,7 +118,8 @@ def _intrinsics(camera: Camera) -> tuple[Floats, Floats]:
 def _reference(rendering: Rendering, weight: Plane, camera: Camera, config: AlignmentConfig) -> list[Floats]:
     """Points of each level of the rendered view, finest first."""
     alpha = rendering.alpha
-    depth = torch.where(alpha > config.min_alpha, rendering.depth, 0.0).numpy()
+    # What is hardly covered saw nothing, so that its black does not bleed into the coarse levels' points.
+    depth = torch.where(alpha > config.min_alpha, rendering.depth, -1.0).numpy()
     intensity = luma(rendering.color / alpha.clamp_min(1e-3)[..., None])
     points = []
     levels = _pyramid(intensity, depth, camera, len(config.iterations))
@@ -137,11 +148,11 @@ class _Photometry:
         if stats[kernels.DEPTH_WEIGHT] > 0:
             self.depth_scale = max(0.3, float(stats[kernels.DEPTH_SQUARES] / stats[kernels.DEPTH_WEIGHT]) ** 0.5)
         total = float(stats[kernels.GAIN_W])
-        if total > 100:
+        if total > _ENOUGH_FOR_EXPOSURE:
             reference, live = float(stats[kernels.GAIN_R]) / total, float(stats[kernels.GAIN_L]) / total
             variance = float(stats[kernels.GAIN_RR]) / total - reference**2
             covariance = float(stats[kernels.GAIN_RL]) / total - reference * live
-            self.gain = min(1.5, max(0.67, (covariance + 0.002) / (variance + 0.002)))
+            self.gain = min(1.5, max(0.67, (covariance + _FLAT_VARIANCE) / (variance + _FLAT_VARIANCE)))
             self.offset = live - self.gain * reference
 
 
@@ -202,14 +213,15 @@ def align(frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, co
             passes += 1
             if np.linalg.norm(step[:3]) < 3e-4 and np.linalg.norm(step[3:]) < 3e-4 and number > 0:
                 break
-    seen, agreeing = float(stats[kernels.IN_VIEW]), float(stats[kernels.AGREEING])
+    finest = next(number for number, passes_there in enumerate(config.iterations) if passes_there)
+    readings = float(stats[kernels.READINGS])
     return Alignment(
         T_map_cam=T_map_ref @ se3.inverse(torch.from_numpy(T)),
         iterations=passes,
         color_residual=photometry.color_scale,
         depth_residual=photometry.depth_scale,
-        overlap=seen / max(len(points[0]), 1),
-        agreement=agreeing / max(seen, 1.0),
+        overlap=float(stats[kernels.IN_VIEW]) / max(len(points[finest]), 1),
+        agreement=float(stats[kernels.AGREEING]) / readings if readings else 1.0,
         correlation=correlation(
             *(float(stats[k]) for k in (kernels.GAIN_W, kernels.GAIN_R, kernels.GAIN_L)),
             *(float(stats[k]) for k in (kernels.GAIN_RR, kernels.GAIN_RL, kernels.GAIN_LL)),

@@ -14,9 +14,9 @@ POINT = 8
 # Entries of the statistics that one pass leaves.
 (
     COLOR_SQUARES, COLOR_WEIGHT, DEPTH_SQUARES, DEPTH_WEIGHT,
-    GAIN_W, GAIN_R, GAIN_L, GAIN_RR, GAIN_RL, GAIN_LL, IN_VIEW, AGREEING,
-) = range(12)  # fmt: skip
-STATISTICS = 12
+    GAIN_W, GAIN_R, GAIN_L, GAIN_RR, GAIN_RL, GAIN_LL, IN_VIEW, READINGS, AGREEING,
+) = range(13)  # fmt: skip
+STATISTICS = 13
 
 STUDENT_DOF = np.float32(5)
 """Student-t degrees of freedom: the weight (dof + 1) / (dof + (r/s)^2) of Kerl et al., ICRA 2013."""
@@ -143,7 +143,7 @@ def normal_equations(
     A point X of the reference camera goes to Y = R X + t in the live camera; the pose is perturbed on the left,
     Y + rho + omega x Y. Residuals:
     colour     r = I_live(pi(Y)) - (gain I_ref + offset)                  in grey levels of [0, 1]
-    geometry   r = (D_live(pi(Y)) - Y_z) (n . ray), over sigma_z           point to plane along the viewing ray
+    geometry   r = (D_live(pi(Y)) - Y_z) (n . ray), over sigma_z |n . ray|  point to plane along the viewing ray
     with sigma_z(d) = sigma_floor + sigma_slope (d - 0.4)^2 metres (Nguyen et al., 3DIMPVT 2012). A point whose depth
     disagrees by more than `gate` (1 + z/2) metres is hidden or has moved, and neither of its residuals counts.
     """
@@ -168,9 +168,11 @@ def normal_equations(
         stats[IN_VIEW] += 1
         weight = p[WEIGHT]
         if d > 0:
+            stats[READINGS] += 1
             behind = d - Z
             if abs(behind) > gate * (_ONE + _HALF * d):
                 continue
+            stats[AGREEING] += 1
             nx = R[0, 0] * p[NX] + R[0, 1] * p[NY] + R[0, 2] * p[NZ]
             ny = R[1, 0] * p[NX] + R[1, 1] * p[NY] + R[1, 2] * p[NZ]
             nz = R[2, 0] * p[NX] + R[2, 1] * p[NY] + R[2, 2] * p[NZ]
@@ -180,13 +182,12 @@ def normal_equations(
                 r = behind * facing
                 scaled = r / (sigma * depth_scale)
                 student = (STUDENT_DOF + _ONE) / (STUDENT_DOF + scaled * scaled)
-                stats[DEPTH_SQUARES] += student * (r / sigma) * (r / sigma)
-                stats[DEPTH_WEIGHT] += 1
+                stats[DEPTH_SQUARES] += weight * student * (r / sigma) * (r / sigma)
+                stats[DEPTH_WEIGHT] += weight
                 # r = n . (surface point - Y) to first order, so dr/drho = -n, dr/domega = -(Y x n).
                 j[0], j[1], j[2] = -nx, -ny, -nz
                 j[3], j[4], j[5] = Z * ny - Y * nz, X * nz - Z * nx, Y * nx - X * ny
                 _add(H, g, weight * student * depth_weight / (sigma * sigma * depth_scale * depth_scale), r, j)
-        stats[AGREEING] += 1
         x0, y0 = int(u), int(v)
         a, b = u - np.float32(x0), v - np.float32(y0)
         w00, w10, w01, w11 = (_ONE - a) * (_ONE - b), a * (_ONE - b), (_ONE - a) * b, a * b
@@ -204,17 +205,18 @@ def normal_equations(
         r = live - (gain * reference + offset)
         scaled = r / color_scale
         student = (STUDENT_DOF + _ONE) / (STUDENT_DOF + scaled * scaled)
-        stats[COLOR_SQUARES] += student * r * r
-        stats[COLOR_WEIGHT] += 1
-        stats[GAIN_W] += student
-        stats[GAIN_R] += student * reference
-        stats[GAIN_L] += student * live
-        stats[GAIN_RR] += student * reference * reference
-        stats[GAIN_RL] += student * reference * live
-        stats[GAIN_LL] += student * live * live
+        counts = weight * student
+        stats[COLOR_SQUARES] += counts * r * r
+        stats[COLOR_WEIGHT] += weight
+        stats[GAIN_W] += counts
+        stats[GAIN_R] += counts * reference
+        stats[GAIN_L] += counts * live
+        stats[GAIN_RR] += counts * reference * reference
+        stats[GAIN_RL] += counts * reference * live
+        stats[GAIN_LL] += counts * live * live
         dX, dY = du * focal[0] * iz, dv * focal[1] * iz
         dZ = -(dX * X + dY * Y) * iz
         j[0], j[1], j[2] = dX, dY, dZ
         j[3], j[4], j[5] = Y * dZ - Z * dY, Z * dX - X * dZ, X * dY - Y * dX
-        _add(H, g, weight * student * color_weight / (color_scale * color_scale), r, j)
+        _add(H, g, counts * color_weight / (color_scale * color_scale), r, j)
     return H, g, stats

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 
 from tcgsplat.confidence import equations as eq
+from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import quaternion, se3
 from tcgsplat.render.losses import color_error, depth_error
 from tcgsplat.render.protocol import Rasterizer
@@ -41,6 +42,12 @@ class DescentConfig:
     """Leave out pixels whose depth error exceeds this many medians (50 on Replica and ScanNet); 0 for never. [base]"""
     mask_color: bool = True
     """Let the mask of valid depth count for colour too. [base]"""
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ConfigError(f"tracker.descent.iterations is {self.iterations!r}; it must be at least 1")
+        if not 0 <= self.color_weight <= 1:
+            raise ConfigError(f"tracker.descent.color_weight is {self.color_weight!r}; it must be between 0 and 1")
 
 
 def weighted_residual(rendering: Rendering, weight: Plane, frame: Frame, config: DescentConfig) -> torch.Tensor:
@@ -111,6 +118,5 @@ def descend(
         adam.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         adam.step()
-    if best is None:
-        raise ValueError("descent needs at least one iteration")
+    assert best is not None
     return Descent(best.T_map_cam, config.iterations, best.loss)

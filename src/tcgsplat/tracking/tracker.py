@@ -47,6 +47,9 @@ class TrackerConfig:
     def __post_init__(self) -> None:
         if self.solver not in ("alignment", "descent"):
             raise ConfigError(f"tracker.solver is {self.solver!r}; choose alignment or descent")
+        for name in ("max_step", "max_turn"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"tracker.{name} is {getattr(self, name)!r}; it must be above 0")
 
 
 @dataclass(frozen=True)
@@ -58,9 +61,13 @@ class Tracked:
     lost: str = ""
     """Why the solver's pose is not believed; empty if it is."""
     iterations: int = 0
+    """Passes or steps of the solver."""
     overlap: float = 1.0
+    """Share of the mapped view that is in the picture."""
     agreement: float = 1.0
+    """Share of the depth readings there that agree with the map."""
     correlation: float = 1.0
+    """Between the colours of the picture and of the map, in [-1, 1]."""
 
     @property
     def converged(self) -> bool:
