@@ -96,6 +96,19 @@ def _axes(J, Q, cam):
     )  # fmt: skip
 
 
+@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always")
+def _plane_and_footprint(m):
+    """From scaled axes: cov(u, v); slopes of the plane, z regressed on (u, v); blurred variances and 1 / determinant."""
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = m
+    uu, uv, vv = m00 * m00 + m01 * m01 + m02 * m02, m00 * m10 + m01 * m11 + m02 * m12, m10 * m10 + m11 * m11 + m12 * m12
+    uz, vz = m00 * m20 + m01 * m21 + m02 * m22, m10 * m20 + m11 * m21 + m12 * m22
+    au, av = uu + _SOFT, vv + _SOFT
+    plane_inverse = _ONE / (au * av - uv * uv)
+    slope_u, slope_v = (av * uz - uv * vz) * plane_inverse, (au * vz - uv * uz) * plane_inverse
+    bu, bv = uu + _BLUR, vv + _BLUR
+    return uv, (slope_u, slope_v, au, av, plane_inverse), (bu, bv, uv, _ONE / (bu * bv - uv * uv))
+
+
 @njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
 def forward(P, n, start, stop, cam, records, depths, tiles):
     """Records, depths and tile rectangles (x0, y0, x1, y1 as rows of `tiles`; x1 < x0: not visible) of a range."""
@@ -105,18 +118,9 @@ def forward(P, n, start, stop, cam, records, depths, tiles):
         _, (x, y, z_true, z, iz), (a, b, a_c, b_c), _, J, _, Q = _expand(P, n, i, cam)
         n00, n01, n02, n10, n11, n12, n20, n21, n22 = _axes(J, Q, cam)
         s0, s1, s2 = load(P, SCALE * n + i), load(P, (SCALE + 1) * n + i), load(P, (SCALE + 2) * n + i)
-        m00, m01, m02 = n00 * s0, n01 * s1, n02 * s2
-        m10, m11, m12 = n10 * s0, n11 * s1, n12 * s2
-        m20, m21, m22 = n20 * s0, n21 * s1, n22 * s2
-        uu, uv, vv = m00 * m00 + m01 * m01 + m02 * m02, m00 * m10 + m01 * m11 + m02 * m12, m10 * m10 + m11 * m11 + m12 * m12
-        uz, vz = m00 * m20 + m01 * m21 + m02 * m22, m10 * m20 + m11 * m21 + m12 * m22
-        # The splat's plane: regress z on (u, v).
-        au, av = uu + _SOFT, vv + _SOFT
-        inverse = _ONE / (au * av - uv * uv)
-        slope_u, slope_v = (av * uz - uv * vz) * inverse, (au * vz - uv * uz) * inverse
-        # The footprint's quadratic form, in log2 units.
-        bu, bv = uu + _BLUR, vv + _BLUR
-        scaled = (_ONE / (bu * bv - uv * uv)) * _HALF_LOG2E
+        m = n00 * s0, n01 * s1, n02 * s2, n10 * s0, n11 * s1, n12 * s2, n20 * s0, n21 * s1, n22 * s2
+        _, (slope_u, slope_v, _, _, _), (bu, bv, uv, inverse) = _plane_and_footprint(m)
+        scaled = inverse * _HALF_LOG2E  # the footprint's quadratic form, in log2 units
         A, B, C = bv * scaled, uv * scaled * np.float32(-2), bu * scaled
         u, v = a * cam[FOCAL] + cam[CENTER], b * cam[FOCAL + 1] + cam[CENTER + 1]
         log2_opacity = load(P, LOG2_OPACITY * n + i)
@@ -159,16 +163,9 @@ def backward(P, n, start, stop, cam, sums, first, grads, pose):
         (X, Y, Z), (x, y, z_true, z, iz), (a, b, a_c, b_c), (ju, jv), J, (w, p, q, r, inverse_length), Q = _expand(P, n, i, cam)
         n00, n01, n02, n10, n11, n12, n20, n21, n22 = _axes(J, Q, cam)
         s0, s1, s2 = load(P, SCALE * n + i), load(P, (SCALE + 1) * n + i), load(P, (SCALE + 2) * n + i)
-        m00, m01, m02 = n00 * s0, n01 * s1, n02 * s2
-        m10, m11, m12 = n10 * s0, n11 * s1, n12 * s2
-        m20, m21, m22 = n20 * s0, n21 * s1, n22 * s2
-        uu, uv, vv = m00 * m00 + m01 * m01 + m02 * m02, m00 * m10 + m01 * m11 + m02 * m12, m10 * m10 + m11 * m11 + m12 * m12
-        uz, vz = m00 * m20 + m01 * m21 + m02 * m22, m10 * m20 + m11 * m21 + m12 * m22
-        au, av = uu + _SOFT, vv + _SOFT
-        plane_inverse = _ONE / (au * av - uv * uv)
-        slope_u, slope_v = (av * uz - uv * vz) * plane_inverse, (au * vz - uv * uz) * plane_inverse
-        bu, bv = uu + _BLUR, vv + _BLUR
-        inverse = _ONE / (bu * bv - uv * uv)
+        m = n00 * s0, n01 * s1, n02 * s2, n10 * s0, n11 * s1, n12 * s2, n20 * s0, n21 * s1, n22 * s2
+        uv, (slope_u, slope_v, au, av, plane_inverse), (bu, bv, _, inverse) = _plane_and_footprint(m)
+        m00, m01, m02, m10, m11, m12, m20, m21, m22 = m
         ca, cb, cc = bv * inverse, zero - uv * inverse, bu * inverse
 
         # Footprint: d ln(alpha) = -1/2 d(offset^T conic offset).
