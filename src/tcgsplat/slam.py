@@ -31,8 +31,9 @@ class StepReport:
 
     frame_index: int
     tracked: Tracked
+    """Its pose is in the submap that was active when the frame came: in `sealed`, where that is given."""
     mapped: Mapped | None
-    """None where the frame was not mapped."""
+    """None where the frame was not mapped. Holds the submap with its keyframes: read it, do not keep it."""
     sealed: Submap | None
     """The submap that this frame ended: to be written down, since SLAM forgets it now."""
     submap_index: int
