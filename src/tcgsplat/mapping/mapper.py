@@ -121,18 +121,18 @@ class Mapper:
     def _optimized(self, submap: Submap, iterations: int) -> tuple[Submap, float]:
         """Adam over drawn keyframes; faint Gaussians are dropped halfway and at the end."""
         before, loss = submap.gaussians, torch.zeros(())
-        adam = RowAdam(submap.gaussians, self._config.rates)
+        adam, scale = RowAdam(submap.gaussians, self._config.rates), self._step_scale(submap)
+        literal = self._confidence.step_scale_mode == "gradient"
         T_cam_map = [se3.inverse(keyframe.T_map_cam) for keyframe in submap.keyframes]
         for iteration in range(iterations):
             if iteration == iterations // 2 and iteration > 0:
                 keep = adam.detached().opacities >= self._config.min_opacity
                 submap, before, adam = submap.kept(keep), before.kept(keep), adam.kept(keep)
+                scale = self._step_scale(submap)
             view = self._drawn_view(len(submap.keyframes))
             frame, gaussians = submap.keyframes[view].frame, adam.gaussians
             rendering = render(gaussians, submap.confidence.value, frame.camera, T_cam_map[view], self._rasterizer)
             loss = self._loss(rendering, frame, gaussians, before, submap)
-            scale = self._step_scale(submap)
-            literal = self._confidence.step_scale_mode == "gradient"
             adam.step(
                 loss,
                 frozen=("sh",) if iteration < self._config.frozen_color_share * iterations else (),

@@ -62,7 +62,7 @@ def _blurred(images: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
 def ssim_map(rendered: Image, observed: Image) -> Float[Tensor, "h w 3"]:
     """Structural similarity at every pixel and channel, in [-1, 1] (Wang et al. 2004), differentiable by `rendered`.
 
-    On the CPU in float32 by kernels of its own, thirty times faster than the same in torch; else in torch.
+    On the CPU in float32 by kernels of its own, else in torch.
     """
     a, b = rendered, observed
     if a.device.type == "cpu" and a.dtype == torch.float32:
