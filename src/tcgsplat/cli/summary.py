@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
-from tcgsplat.render.numba_cpu.rasterizer import available_cores
+from tcgsplat.render.numba_cpu.workers import available_cores
 from tcgsplat.slam import StepReport
 
 PACKAGES = ("tcgsplat", "torch", "numba", "numpy")
