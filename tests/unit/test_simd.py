@@ -103,3 +103,17 @@ def test_integers():
     values = np.linspace(-3, 40, 16).astype(np.float32)
     assert _integers(values, out) == int(math.log2(8))
     np.testing.assert_array_equal(out, values.astype(np.int32))
+
+
+@njit(fastmath=simd.MATH)
+def _log2(a, out):
+    for i in range(0, a.size, 16):
+        simd.store(out, i, simd.log2(simd.load(a, i)))
+
+
+def test_log2_is_accurate_from_tiny_to_huge_and_near_one():
+    a = np.concatenate((np.exp2(np.linspace(-100, 100, 4096)), np.linspace(0.5, 2, 4096))).astype(np.float32)
+    out = np.empty_like(a)
+    _log2(a, out)
+    true = np.log2(a.astype(np.float64))
+    assert np.all(np.abs(out - true) < 2e-7 + 1e-7 * np.abs(true))
