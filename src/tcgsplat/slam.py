@@ -84,7 +84,14 @@ class Slam:
             self.submap = judged(mapped, frame, self.config.confidence, self.config.mapper.depth_mode)
 
         self.trajectory = self.trajectory.with_row(
-            TrackedPose(frame.index, frame.timestamp, self.submap.index, T_map_cam, lost=not tracked.converged)
+            TrackedPose(
+                frame.index,
+                frame.timestamp,
+                self.submap.index,
+                T_map_cam,
+                lost=not tracked.converged,
+                mapped=mapped is not None,
+            )
         )
         return StepReport(
             frame_index=frame.index,

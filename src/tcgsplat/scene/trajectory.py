@@ -21,6 +21,9 @@ class TrackedPose:
     T_map_cam: Pose
     lost: bool = False
     """The pose is a prediction: tracking did not converge."""
+    mapped: bool = False
+    """The map was optimised on this frame; it may have been dropped from the keyframes since. A frame that is neither
+    mapped nor lost is withheld from the map: what the map shows of it tells how well it shows new views."""
 
 
 @dataclass(frozen=True)

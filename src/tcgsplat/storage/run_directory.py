@@ -119,6 +119,7 @@ class RunDirectory:
                 "timestamp": np.array([row.timestamp for row in rows], dtype=np.float64),
                 "submap_index": np.array([row.submap_index for row in rows], dtype=np.int64),
                 "lost": np.array([row.lost for row in rows], dtype=np.bool_),
+                "mapped": np.array([row.mapped for row in rows], dtype=np.bool_),
                 "T_map_cam": _stacked([row.T_map_cam for row in rows]),
                 "T_world_map": _stacked(list(atlas.T_world_map)),
             },
@@ -129,6 +130,9 @@ class RunDirectory:
     def trajectory(self) -> tuple[Trajectory, Atlas]:
         """The path and the submap poses as last written; both empty if the run has sealed nothing yet.
 
+        A run of an older tcgsplat does not say which frames it mapped: then no row is `mapped`, while in any other run
+        at least the first row of each submap is.
+
         Raises:
             ArchiveError: if the file is damaged or of another version.
         """
@@ -136,13 +140,15 @@ class RunDirectory:
         if not path.exists():
             return Trajectory(), Atlas()
         columns = archive.read_arrays(path, "trajectory")
+        unknown = np.zeros(len(columns["lost"]), np.bool_)
         rows = tuple(
-            TrackedPose(int(frame), float(stamp), int(submap), torch.from_numpy(T), bool(lost))
-            for frame, stamp, submap, lost, T in zip(
+            TrackedPose(int(frame), float(stamp), int(submap), torch.from_numpy(T), bool(lost), bool(mapped))
+            for frame, stamp, submap, lost, mapped, T in zip(
                 columns["frame_index"],
                 columns["timestamp"],
                 columns["submap_index"],
                 columns["lost"],
+                columns.get("mapped", unknown),
                 columns["T_map_cam"],
                 strict=True,
             )
