@@ -117,3 +117,34 @@ def test_log2_is_accurate_from_tiny_to_huge_and_near_one():
     _log2(a, out)
     true = np.log2(a.astype(np.float64))
     assert np.all(np.abs(out - true) < 2e-7 + 1e-7 * np.abs(true))
+
+
+@njit(fastmath=simd.MATH)
+def _gather(array, indices, out):
+    simd.store(out, 0, simd.gather(array, 3, simd.load(indices, 0)))
+
+
+def test_gather_takes_a_value_for_every_lane():
+    rng = np.random.default_rng(2)
+    array = rng.normal(size=100).astype(np.float32)
+    indices = rng.integers(-3, 97, 16)
+    out = np.zeros(16, np.float32)
+    _gather(array, (indices + np.where(indices >= 0, 0.9, 0)).astype(np.float32), out)
+    np.testing.assert_array_equal(out, array[3 + indices])
+
+
+@njit(fastmath=simd.MATH)
+def _squares(image, x, y, out):
+    squares = simd.gather_squares(image, 4 * image.shape[1], simd.load(x, 0), simd.load(y, 0))
+    simd.store_transposed(out, 0, squares)
+
+
+def test_gather_squares_takes_four_pixels_for_every_lane():
+    rng = np.random.default_rng(3)
+    image = rng.normal(size=(7, 9, 4)).astype(np.float32)
+    x, y = rng.uniform(0, 8, 16).astype(np.float32), rng.uniform(0, 6, 16).astype(np.float32)
+    x[0], y[0], x[1], y[1] = 0, 0, 7.9, 5.9  # the first square and the last
+    out = np.zeros((16, 2, 2, 4), np.float32)
+    _squares(image, x, y, out.reshape(-1))
+    for square, column, row in zip(out, x.astype(int), y.astype(int), strict=True):
+        np.testing.assert_array_equal(square, image[row : row + 2, column : column + 2])
