@@ -16,8 +16,9 @@ from analytic_room import Room  # after the line above, or what it imports would
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.feedback import judged
-from tcgsplat.mapping.mapper import Mapper, MapperConfig
+from tcgsplat.mapping.mapper import Mapper
 from tcgsplat.mapping.seeding import IdSource, SeedingConfig
+from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.backends import open_rasterizer
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.submap import Submap

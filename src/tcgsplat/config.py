@@ -18,8 +18,8 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.errors import ConfigError
-from tcgsplat.mapping.mapper import MapperConfig
 from tcgsplat.mapping.schedule import ScheduleConfig
+from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.tracking.tracker import TrackerConfig
 
 Value = bool | int | float | str | tuple[bool | int | float | str, ...]

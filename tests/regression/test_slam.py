@@ -11,9 +11,9 @@ from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.config import SlamConfig
 from tcgsplat.datasets.sequence import Sequence
 from tcgsplat.geometry import se3
-from tcgsplat.mapping.mapper import MapperConfig
 from tcgsplat.mapping.schedule import ScheduleConfig
 from tcgsplat.mapping.seeding import SeedingConfig
+from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.numba_cpu import NumbaRasterizer
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import render_view

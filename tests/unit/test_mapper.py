@@ -12,9 +12,11 @@ from torch import Tensor
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
-from tcgsplat.mapping.mapper import Mapped, Mapper, MapperConfig, self_distance
+from tcgsplat.mapping.mapper import Mapped, Mapper
+from tcgsplat.mapping.optimization import self_distance
 from tcgsplat.mapping.optimizer import LearningRates
 from tcgsplat.mapping.seeding import IdSource, SeedingConfig
+from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import render_view
 from tcgsplat.scene.frame import Frame

@@ -7,7 +7,8 @@ import torch
 from tcgsplat.confidence import equations as eq
 from tcgsplat.confidence.state import ConfidenceConfig, Observation
 from tcgsplat.geometry import se3
-from tcgsplat.mapping.mapper import Mapped, self_distance
+from tcgsplat.mapping.mapper import Mapped
+from tcgsplat.mapping.optimization import self_distance
 from tcgsplat.render.losses import color_error, depth_error
 from tcgsplat.render.view import DepthMode
 from tcgsplat.scene.frame import Frame

@@ -46,7 +46,7 @@ class RowAdam:
         self._parameters = {name: getattr(gaussians, name).clone().requires_grad_() for name in PARAMETERS}
         self._first = {name: torch.zeros_like(p) for name, p in self._parameters.items()}
         self._second = {name: torch.zeros_like(p) for name, p in self._parameters.items()}
-        self._steps = dict.fromkeys(PARAMETERS, 0)
+        self._steps = {name: p.new_zeros(len(p), dtype=torch.float64) for name, p in self._parameters.items()}
         self._template = gaussians
 
     @property
@@ -58,12 +58,20 @@ class RowAdam:
         """The Gaussians as they are now, as plain values that later steps leave alone."""
         return replace(self._template, **{name: p.detach().clone() for name, p in self._parameters.items()})
 
-    def step(self, loss: Tensor, frozen: tuple[str, ...] = (), gradient_scale: PerGaussian | None = None,
-             step_scale: PerGaussian | None = None) -> None:  # fmt: skip
+    def step(
+        self,
+        loss: Tensor,
+        visible: PerGaussianFlag | None = None,
+        frozen: tuple[str, ...] = (),
+        gradient_scale: PerGaussian | None = None,
+        step_scale: PerGaussian | None = None,
+    ) -> None:
         """Follow the gradient of `loss` by one Adam step.
 
         Args:
             loss: Scalar that depends on `gaussians`.
+            visible: Rows that take part; the others stay, and so do their moments and their count of steps. None
+                for all.
             frozen: Names of parameters that stay.
             gradient_scale: Eq. 24 to the letter: multiplies the geometry's gradients.
             step_scale: Eq. 24 as it is meant: multiplies the geometry's steps.
@@ -74,24 +82,30 @@ class RowAdam:
             for name, gradient in zip(active, gradients, strict=True):
                 if gradient is None:
                     continue
-                g = torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)  # one bad pixel must not end a map
+                rows = torch.arange(len(gradient)) if visible is None else visible.nonzero().flatten()
+                shape = (-1, *[1] * (gradient.dim() - 1))
+                g = torch.nan_to_num(
+                    gradient[rows], nan=0.0, posinf=0.0, neginf=0.0
+                )  # one bad pixel must not end a map
                 if name in GEOMETRY and gradient_scale is not None:
-                    g = g * gradient_scale[:, None]
-                self._steps[name] += 1  # of its own: moments of what was frozen are as young as its first gradient
-                correction_1, correction_2 = 1 - BETA_1 ** self._steps[name], 1 - BETA_2 ** self._steps[name]
-                first = self._first[name].lerp_(g, 1 - BETA_1)
-                second = self._second[name].mul_(BETA_2).addcmul_(g, g, value=1 - BETA_2)
-                step = first / (second / correction_2).sqrt_().add_(EPSILON)
+                    g = g * gradient_scale[rows, None]
+                self._steps[name][rows] += 1  # moments are as young as a row's first gradient
+                steps = self._steps[name][rows].view(shape)
+                first = self._first[name][rows].lerp(g, 1 - BETA_1)
+                second = BETA_2 * self._second[name][rows] + (1 - BETA_2) * g * g
+                self._first[name][rows], self._second[name][rows] = first, second
+                young_1, young_2 = ((1 - beta**steps).to(g) for beta in (BETA_1, BETA_2))
+                step = first / young_1 / ((second / young_2).sqrt() + EPSILON)
                 if name in GEOMETRY and step_scale is not None:
-                    step *= step_scale[:, None]
+                    step *= step_scale[rows, None]
                 if name == "sh":
                     step[:, 1:] *= 0.05
-                self._parameters[name].sub_(step, alpha=getattr(self._rates, name) / correction_1)
+                self._parameters[name][rows] -= getattr(self._rates, name) * step
 
     def kept(self, keep: PerGaussianFlag) -> "RowAdam":
         """The optimiser of the flagged rows only, moments included."""
         smaller = RowAdam(self.detached().kept(keep), self._rates)
         smaller._first = {name: moment[keep] for name, moment in self._first.items()}
         smaller._second = {name: moment[keep] for name, moment in self._second.items()}
-        smaller._steps = dict(self._steps)
+        smaller._steps = {name: steps[keep] for name, steps in self._steps.items()}
         return smaller

@@ -10,7 +10,7 @@ from torch import Tensor
 from tcgsplat.render import ssim_kernels
 from tcgsplat.tensors import Image, Plane
 
-_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 _SSIM_RADIUS, _SSIM_SIGMA = ssim_kernels.RADIUS, 1.5
 
 
@@ -24,7 +24,8 @@ def depth_error(rendered: Plane, observed: Plane) -> Plane:
     return torch.where(observed > 0, (rendered - observed).abs(), 0.0)
 
 
-def _window(dtype: torch.dtype = torch.float32) -> Float[Tensor, " k"]:
+def ssim_window(dtype: torch.dtype = torch.float32) -> Float[Tensor, " k"]:
+    """The Gaussian weights of SSIM's windows, 11 pixels wide."""
     x = torch.arange(-_SSIM_RADIUS, _SSIM_RADIUS + 1, dtype=torch.float64)
     window = torch.exp(-0.5 * (x / _SSIM_SIGMA) ** 2)
     return (window / window.sum()).to(dtype)
@@ -36,9 +37,11 @@ class _CpuSsim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rendered: Tensor, observed: Tensor) -> Tensor:
         a, b = (np.ascontiguousarray(x.detach().permute(2, 0, 1).numpy()) for x in (rendered, observed))
-        window = _window().numpy()
+        window = ssim_window().numpy()
         similarity, *partials = (np.empty_like(a) for _ in range(4))
-        ssim_kernels.forward(a, b, window, np.float32(_SSIM_C1), np.float32(_SSIM_C2), similarity, *partials)
+        ssim_kernels.forward(
+            a, b, window, np.float32(SSIM_C1), np.float32(SSIM_C2), 0, a.shape[1], similarity, *partials
+        )
         ctx.inputs = a, b, partials, window
         return torch.from_numpy(similarity).permute(1, 2, 0)
 
@@ -46,13 +49,13 @@ class _CpuSsim(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         a, b, partials, window = ctx.inputs
         upstream, out = np.ascontiguousarray(gradient.permute(2, 0, 1).numpy()), np.empty_like(a)
-        ssim_kernels.backward(upstream, a, b, *partials, window, out)  # type: ignore[call-arg]
+        ssim_kernels.backward(upstream, a, b, *partials, window, 0, a.shape[1], out)  # type: ignore[call-arg]
         return torch.from_numpy(out).permute(1, 2, 0), None
 
 
 def _blurred(images: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
     """Gaussian window of 11 pixels and sigma 1.5, zeros beyond the border."""
-    window = _window(images.dtype).to(images.device)
+    window = ssim_window(images.dtype).to(images.device)
     planes = images.permute(2, 0, 1)[:, None]
     across = torch.nn.functional.conv2d(planes, window[None, None, None, :], padding=(0, _SSIM_RADIUS))
     down = torch.nn.functional.conv2d(across, window[None, None, :, None], padding=(_SSIM_RADIUS, 0))
@@ -70,8 +73,8 @@ def ssim_map(rendered: Image, observed: Image) -> Float[Tensor, "h w 3"]:
         return similarity
     mean_a, mean_b, aa, bb, ab = _blurred(torch.cat((a, b, a * a, b * b, a * b), dim=-1)).chunk(5, dim=-1)
     var_a, var_b, cov = aa - mean_a * mean_a, bb - mean_b * mean_b, ab - mean_a * mean_b
-    structure = (2 * cov + _SSIM_C2) / (var_a + var_b + _SSIM_C2)
-    luminance = (2 * mean_a * mean_b + _SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + _SSIM_C1)
+    structure = (2 * cov + SSIM_C2) / (var_a + var_b + SSIM_C2)
+    luminance = (2 * mean_a * mean_b + SSIM_C1) / (mean_a * mean_a + mean_b * mean_b + SSIM_C1)
     return luminance * structure
 
 

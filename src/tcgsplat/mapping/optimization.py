@@ -1,0 +1,176 @@
+"""The optimisation of one mapping update: Adam on Eq. 21, over the views of a submap's keyframes.
+
+`AutogradOptimization` works with every rasterizer and setting and is the plain statement of what is done;
+`native_optimization.py` does the same by CPU kernels, without autograd, and is held to it by tests.
+"""
+
+from dataclasses import replace
+from typing import Protocol, runtime_checkable
+
+import torch
+
+from tcgsplat.confidence import equations as eq
+from tcgsplat.confidence.state import ConfidenceConfig
+from tcgsplat.geometry import se3
+from tcgsplat.mapping.optimizer import RowAdam
+from tcgsplat.mapping.settings import MapperConfig
+from tcgsplat.render.losses import color_error, depth_error, isotropy_error, ssim_map
+from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.render.view import Rendering, render
+from tcgsplat.scene.frame import Frame
+from tcgsplat.scene.gaussians import Gaussians
+from tcgsplat.scene.submap import Submap
+from tcgsplat.tensors import PerGaussian, PerGaussianFlag
+
+
+@runtime_checkable
+class Optimization(Protocol):
+    """A submap while it is optimised: mutable, made for one mapping update, dropped after it."""
+
+    def step(self, view: int, frozen: tuple[str, ...] = ()) -> None:
+        """Follow the gradient of Eq. 21 at one keyframe by one Adam step of every Gaussian in view.
+
+        Parameters named in `frozen` stay.
+        """
+        ...
+
+    def prune(self) -> None:
+        """Drop the Gaussians that have become fainter than `min_opacity`."""
+        ...
+
+    @property
+    def loss(self) -> float:
+        """Eq. 21 before the last step."""
+        ...
+
+    def submap(self) -> Submap:
+        """The submap as it is now, a value that later steps leave alone."""
+        ...
+
+
+def begin(submap: Submap, config: MapperConfig, confidence: ConfidenceConfig, rasterizer: Rasterizer) -> Optimization:
+    """The fastest optimisation that the rasterizer and the settings allow."""
+    if rasterizer.name == "numba":  # what knows numba takes its time to import
+        from tcgsplat.mapping.native_optimization import NativeOptimization, covers  # noqa: PLC0415
+        from tcgsplat.render.numba_cpu import NumbaRasterizer  # noqa: PLC0415
+
+        if isinstance(rasterizer, NumbaRasterizer) and covers(config, confidence):
+            return NativeOptimization(submap, config, confidence, rasterizer.passes)
+    return AutogradOptimization(submap, config, confidence, rasterizer)
+
+
+class AutogradOptimization:
+    """By torch, through any rasterizer."""
+
+    def __init__(
+        self, submap: Submap, config: MapperConfig, confidence: ConfidenceConfig, rasterizer: Rasterizer
+    ) -> None:
+        self._config, self._confidence, self._rasterizer = config, confidence, rasterizer
+        self._submap, self._before = submap, submap.gaussians
+        self._adam = RowAdam(submap.gaussians, config.rates)
+        self._T_cam_map = [se3.inverse(keyframe.T_map_cam) for keyframe in submap.keyframes]
+        self._loss_value = torch.zeros(())
+
+    def step(self, view: int, frozen: tuple[str, ...] = ()) -> None:
+        """See `Optimization`."""
+        frame, gaussians = self._submap.keyframes[view].frame, self._adam.gaussians
+        rendering = render(
+            gaussians, self._submap.confidence.value, frame.camera, self._T_cam_map[view], self._rasterizer
+        )
+        loss = self._loss(rendering, frame, gaussians, self._before, self._submap)
+        scale, literal = self._step_scale(self._submap), self._confidence.step_scale_mode == "gradient"
+        self._adam.step(
+            loss,
+            visible=rendering.visible,
+            frozen=frozen,
+            gradient_scale=scale if literal else None,
+            step_scale=None if literal else scale,
+        )
+        self._loss_value = loss.detach()
+
+    def prune(self) -> None:
+        """See `Optimization`."""
+        keep = self._adam.detached().opacities >= self._config.min_opacity
+        self._submap, self._before = self._submap.kept(keep), self._before.kept(keep)
+        self._adam = self._adam.kept(keep)
+
+    @property
+    def loss(self) -> float:
+        """See `Optimization`."""
+        return float(self._loss_value)
+
+    def submap(self) -> Submap:
+        """See `Optimization`."""
+        return replace(self._submap, gaussians=self._adam.detached())
+
+    def _loss(
+        self, rendering: Rendering, frame: Frame, gaussians: Gaussians, before: Gaussians, submap: Submap
+    ) -> torch.Tensor:
+        """Eq. 21; means over valid pixels, as the base system takes them."""
+        config, guided = self._config, self._confidence.guide_mapping
+        measured = frame.valid & (frame.depth > 0)
+        pixels = max(int(measured.sum()), 1)
+        weight = eq.mapping_weight(rendering.confidence) if guided else torch.ones_like(rendering.alpha)
+        # Where the picture saw nothing, the rendering is compared with itself, so that no window sees a false edge.
+        seen = torch.where(frame.valid[..., None], rendering.color, frame.color)
+        return eq.mapping_loss(
+            weight,
+            color_error(rendering.color, frame.color) * measured,
+            depth_error(rendering.depth_as(config.depth_mode), frame.depth) * measured,
+            1.0 - ssim_map(seen, frame.color).mean(),
+            isotropy_error(gaussians.scales) if config.isotropy_weight > 0 else torch.zeros(()),
+            self._stability(gaussians, before, submap, rendering.visible) if guided else torch.zeros(()),
+            color_weight=config.color_weight / pixels,
+            depth_weight=config.depth_weight / pixels,
+            ssim_weight=config.ssim_weight,
+            regularization_weight=config.isotropy_weight,
+        )
+
+    def _stability(
+        self, gaussians: Gaussians, before: Gaussians, submap: Submap, visible: PerGaussianFlag
+    ) -> torch.Tensor:
+        """Eq. 23 over the visible Gaussians that existed before this update and have a baseline."""
+        config, state = self._confidence, submap.confidence
+        counted = visible & (state.born < submap.clock) & state.has_baseline
+        maturity = eq.maturity(state.value, submap.clock - state.born, maturity_time=config.maturity_time)
+        # A Gaussian that has not used up its slack adds nothing, neither loss nor gradient, and most have not: only
+        # the others are differentiated.
+        with torch.no_grad():
+            change = self_distance(gaussians, before, config) - state.baseline
+            allowed = eq.allowed_change(maturity, slack_min=config.slack_min, slack_max=config.slack_max)
+            rows = (counted & (change > allowed)).nonzero().flatten()
+        loss = eq.stability_loss(
+            eq.abnormal_change(
+                self_distance(gaussians.picked(rows), before.picked(rows), config), state.baseline[rows]
+            ),
+            maturity[rows],
+            counted[rows],
+            weight=config.stability_weight,
+            slack_min=config.slack_min,
+            slack_max=config.slack_max,
+            reduction="sum",
+        )
+        return loss / counted.sum().clamp_min(1) if config.stability_reduction == "mean" else loss
+
+    def _step_scale(self, submap: Submap) -> PerGaussian | None:
+        """Eq. 24, or nothing where confidence does not guide mapping."""
+        config = self._confidence
+        if not config.guide_mapping:
+            return None
+        return eq.step_scale(
+            submap.confidence.value,
+            smallest=config.step_scale_min,
+            largest=config.step_scale_max,
+            p_min=config.p_min,
+        )
+
+
+def self_distance(after: Gaussians, before: Gaussians, config: ConfidenceConfig) -> PerGaussian:
+    """How far each Gaussian has moved since `before` (equations 5 to 8); rows must be the same Gaussians, metres."""
+    return eq.self_distance(
+        eq.mean_change(after.means, before.means),
+        eq.scale_change(after.log_scales, before.log_scales),
+        eq.rotation_change(after.quats, before.quats),
+        scale_weight=config.scale_change_weight,
+        rotation_weight=config.rotation_change_weight,
+    )

@@ -1,0 +1,129 @@
+"""The kernels of mapping against autograd: the same steps on the same views."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+from analytic_room import Room, pose
+
+from tcgsplat.confidence.state import ConfidenceConfig
+from tcgsplat.geometry import se3
+from tcgsplat.mapping.mapper import Mapper
+from tcgsplat.mapping.native_optimization import NativeOptimization, covers
+from tcgsplat.mapping.optimization import AutogradOptimization, Optimization
+from tcgsplat.mapping.optimizer import PARAMETERS
+from tcgsplat.mapping.seeding import IdSource
+from tcgsplat.mapping.settings import MapperConfig
+from tcgsplat.render.numba_cpu import NumbaRasterizer
+from tcgsplat.scene.submap import Keyframe, Submap
+
+CONFIDENCE = ConfidenceConfig().for_updates_of(10)
+RASTERIZER = NumbaRasterizer()
+
+
+@pytest.fixture(scope="module")
+def submap() -> Submap:
+    """Two keyframes of the room, the second one partly unseen, and Gaussians of all ages."""
+    generator = torch.Generator().manual_seed(3)
+    mapper = Mapper(MapperConfig(first_iterations=3), CONFIDENCE, RASTERIZER, IdSource(), generator)
+    first = mapper.map(Room().frame(), se3.identity(), Submap.anchored(se3.identity(), index=0)).submap
+    T_side = pose(0.05, 0.02, 0.0, degrees=(0, 12, 0))
+    side = Room().frame(T_side)
+    valid = side.valid.clone()
+    valid[:, -5:] = False
+    n = len(first)
+
+    def uniform(low: float, high: float) -> torch.Tensor:
+        return low + (high - low) * torch.rand(n, generator=generator)
+
+    known = replace(
+        first.confidence,
+        value=uniform(0.1, 1.0),
+        baseline=uniform(0.0, 4e-4),
+        born=(uniform(0, 9)).long(),
+        updates=(uniform(0, 3)).long(),
+    )
+    color = (side.color + 0.05 * torch.randn(side.color.shape, generator=generator)).clamp(0, 1)
+    keyframes = (*first.keyframes, Keyframe(replace(side, valid=valid, color=color), T_side))
+    return replace(first, clock=8, confidence=known, keyframes=keyframes)
+
+
+def both(submap: Submap, config: MapperConfig, confidence: ConfidenceConfig) -> Iterator[Optimization]:
+    yield AutogradOptimization(submap, config, confidence, RASTERIZER)
+    yield NativeOptimization(submap, config, confidence, RASTERIZER.passes)
+
+
+GUIDANCE = {
+    "guided": CONFIDENCE,
+    "unguided": replace(CONFIDENCE, guide_mapping=False),
+    "mean": replace(CONFIDENCE, stability_reduction="mean", stability_weight=100.0),
+    "strong": replace(CONFIDENCE, stability_weight=10.0, slack_min=0.0, slack_max=1e-5),
+}
+
+
+@pytest.mark.parametrize("depth_mode", ["composited", "expected", "planar"])
+@pytest.mark.parametrize("guidance", GUIDANCE)
+def test_takes_the_steps_of_autograd(submap: Submap, guidance: str, depth_mode: str) -> None:
+    config = MapperConfig(depth_mode=depth_mode, min_opacity=0.952)  # type: ignore[arg-type]
+    results = []
+    for optimization in both(submap, config, GUIDANCE[guidance]):
+        losses = []
+        for step, view in enumerate((0, 1, 1)):
+            if step == 1:
+                optimization.prune()
+            optimization.step(view)
+            losses.append(optimization.loss)
+        results.append((optimization.submap(), losses))
+    (slow, slow_losses), (fast, fast_losses) = results
+    # Where Eq. 23 is made to dominate, each Gaussian that took a step in the other direction (below) shows in the sum.
+    assert fast_losses == pytest.approx(slow_losses, rel=1e-2 if guidance == "strong" else 2e-5)
+    assert len(fast) < len(submap)
+    assert torch.equal(fast.gaussians.ids, slow.gaussians.ids)
+    assert torch.equal(fast.confidence.value, slow.confidence.value)
+    before = submap.kept(torch.isin(submap.gaussians.ids, fast.gaussians.ids)).gaussians
+    for name in PARAMETERS:
+        step = getattr(config.rates, name)
+        old, a, b = (getattr(g, name) for g in (before, slow.gaussians, fast.gaussians))
+        assert float((a - old).abs().max()) > 0.5 * step
+        # Adam makes a full step of any gradient, so that a sign lost in rounding is a step in the other direction.
+        assert float(((a - b).abs() < 0.02 * step).float().mean()) > 0.98
+
+
+def test_the_same_bits_whatever_the_number_of_threads(submap: Submap) -> None:
+    results = []
+    for threads in (1, 2, 3):
+        optimization = NativeOptimization(submap, MapperConfig(), CONFIDENCE, NumbaRasterizer(threads).passes)
+        for view in (1, 0, 1):
+            optimization.step(view)
+        results.append((optimization.submap().gaussians, optimization.loss))
+    for gaussians, loss in results[1:]:
+        assert loss == results[0][1]
+        assert all(torch.equal(getattr(gaussians, name), getattr(results[0][0], name)) for name in PARAMETERS)
+
+
+def test_what_is_out_of_view_stays(submap: Submap) -> None:
+    away = replace(submap, keyframes=tuple(replace(k, T_map_cam=pose(degrees=(0, 180, 0))) for k in submap.keyframes))
+    for optimization in both(away, MapperConfig(), CONFIDENCE):
+        optimization.step(1)
+        for name in PARAMETERS:
+            assert torch.equal(getattr(optimization.submap().gaussians, name), getattr(submap.gaussians, name))
+
+
+def test_a_nan_in_a_picture_does_not_reach_the_map(submap: Submap) -> None:
+    keyframe = submap.keyframes[0]
+    color = keyframe.frame.color.clone()
+    color[20, 30] = torch.nan
+    broken = replace(submap, keyframes=(replace(keyframe, frame=replace(keyframe.frame, color=color)),))
+    for optimization in both(broken, MapperConfig(), CONFIDENCE):
+        optimization.step(0)
+        for name in PARAMETERS:
+            assert bool(getattr(optimization.submap().gaussians, name).isfinite().all())
+
+
+def test_settings_that_only_autograd_knows_are_left_to_it() -> None:
+    assert covers(MapperConfig(), CONFIDENCE)
+    assert not covers(MapperConfig(sh_degree=1), CONFIDENCE)
+    assert not covers(MapperConfig(isotropy_weight=1.0), CONFIDENCE)
+    assert not covers(MapperConfig(frozen_color_share=0.5), CONFIDENCE)
+    assert not covers(MapperConfig(), replace(CONFIDENCE, step_scale_mode="gradient"))
