@@ -15,7 +15,7 @@ import torch
 from numba import njit
 
 from tcgsplat import __version__
-from tcgsplat.cli import bench, doctor, kernels, logs, presets, summary
+from tcgsplat.cli import doctor, kernels, logs, presets, summary
 from tcgsplat.cli.main import COMMANDS, main
 from tcgsplat.cli.progress import RunProgress, counting
 from tcgsplat.cli.recorder import Part, begin, stopping_on_interrupt
@@ -24,9 +24,7 @@ from tcgsplat.cli.usage import UsageError
 from tcgsplat.config import SlamConfig, from_toml
 from tcgsplat.errors import ArchiveError, ConfigError
 from tcgsplat.geometry import se3
-from tcgsplat.geometry.camera import Camera
 from tcgsplat.presets import preset
-from tcgsplat.render.reference import project
 from tcgsplat.slam import StepReport
 from tcgsplat.storage.run_directory import RunDirectory
 from tcgsplat.tracking.tracker import Tracked
@@ -93,7 +91,11 @@ def test_threads_are_told_to_sleep_before_anything_is_imported(given: dict[str, 
         (["eval", "nowhere"], 1, "tcgsplat: nowhere is not a run; give the folder that `tcgsplat run` wrote"),
         (["eval", "--trajectory", "t.txt"], 2, "tcgsplat: --trajectory needs something to compare with; "),
         (["export", "nowhere"], 1, "tcgsplat: nowhere is not a run; "),
-        (["bench", "nothing"], 2, "render"),
+        (["bench", "nothing"], 2, "render, track"),
+        (["bench", "track"], 2, "FOLDER"),
+        (["bench", "track", "nowhere"], 1, "tcgsplat: no folder nowhere; check the path\n"),
+        (["bench", "track", "nowhere", "--mapper.iteration", "3"], 2, "there is no setting mapper.iteration; did you"),
+        (["bench", "render", "--mapper.iterations", "3"], 2, "bench render has no settings, but --mapper.iterations"),
         (["presets", "default", "--mapper.iterations", "3"], 2, "--mapper.iterations"),
         (["presets", "papier"], 1, "tcgsplat: there is no preset papier; "),
     ],
@@ -312,35 +314,3 @@ def test_doctor_tells_what_can_be_used(capsys: pytest.CaptureFixture[str]):
     assert "numba: usable\n" in text and "AVX-512" in text
     assert "cuda: not usable\n  not built yet in this version" in text
     assert "compiled kernels are kept in" in doctor.numba_finding().facts[2]
-
-
-def test_bench_times_every_stage():
-    times = bench.timed(bench.Size(64, 48, 500), repeats=3, warm_up=1)
-    assert list(times) == [f"{stage}_ms" for stage in bench.STAGES]
-    assert all(ms > 0 for ms in times.values())
-    assert times["iteration_ms"] > max(ms for stage, ms in times.items() if stage != "iteration_ms")
-
-
-def test_bench_writes_the_object_that_was_promised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(bench, "SIZES", (bench.Size(64, 48, 1000), bench.Size(32, 32, 2000)))
-    assert bench.command(bench.Args("render", tmp_path / "times.json", repeats=1)) == 0
-    written = json.loads((tmp_path / "times.json").read_text())
-    assert list(written) == ["64x48/1k", "32x32/2k"]
-    assert written["32x32/2k"]["iteration_ms"] > 0
-
-
-def test_bench_sizes_are_those_of_the_issue():
-    assert [str(size) for size in bench.SIZES] == ["320x240/40k", "640x480/150k", "1200x680/600k"]
-
-
-def test_bench_shows_twenty_five_splats_in_a_pixel():
-    size = bench.Size(80, 60, 2500)  # as dense as 320x240/40k
-    camera = Camera(72.0, 72.0, 40.0, 30.0, 80, 60)
-    splats = bench.scene(size, camera)
-    with torch.no_grad():
-        projected = project(splats, camera, se3.identity())
-        reach = 2 * (255 * splats.opacities).clamp_min(1).log()
-        area = math.pi * reach * torch.linalg.det(projected.covariances).sqrt()
-    assert float(area.sum()) / (80 * 60) == pytest.approx(25, abs=3)
-    again = bench.scene(size, camera)
-    assert torch.equal(again.means, splats.means) and torch.equal(again.features, splats.features)

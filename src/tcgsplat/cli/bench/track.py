@@ -1,0 +1,165 @@
+"""`tcgsplat bench track`: milliseconds of the whole system on a recorded sequence, stage by stage."""
+
+import json
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+
+from tcgsplat import datasets
+from tcgsplat.cli.kernels import compile_kernels
+from tcgsplat.cli.progress import RunProgress, say
+from tcgsplat.cli.recorder import Part
+from tcgsplat.cli.settings import resolved
+from tcgsplat.cli.summary import machine, versions
+from tcgsplat.config import SlamConfig, to_toml
+from tcgsplat.evaluation import ate
+from tcgsplat.render.backends import open_rasterizer
+from tcgsplat.render.numba_cpu.workers import available_cores
+from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.scene.frame import Frame
+from tcgsplat.slam import Slam
+from tcgsplat.storage import atomic
+from tcgsplat.tensors import Pose
+
+
+@dataclass(frozen=True)
+class Args:
+    """Time the whole system on a recorded sequence, at the size that its images have; nothing is written down.
+
+    `load` is waiting for the reader, which decodes the next frames beside; the stages are those of the system, by its
+    own names; `frame` is the whole of a frame: load, stages, and what is between them. The first frame is left out:
+    caches are cold, and the whole first view is mapped. Use `taskset -c 0,1 tcgsplat ...` to allow only some cores.
+    Every setting is a flag, as for `tcgsplat run`.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """The sequence."""
+    limit: int | None = None
+    """Use no more than so many frames."""
+    preset: str = "default"
+    """Where the settings start from: see `tcgsplat presets`."""
+    config: Path | None = None
+    """A TOML file of settings, such as the config.toml of a run."""
+    backend: str = "auto"
+    """Rasterizer: auto, numba or reference."""
+    seed: int | None = None
+    """Of all randomness; that of the preset if left out."""
+    json: Path | None = None
+    """File to write the figures to, with the settings in full."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How long a stage takes over the frames, milliseconds."""
+
+    mean: float
+    """The only one that adds up over the stages."""
+    median: float
+    percentile_95: float
+
+    @staticmethod
+    def of(seconds: Iterable[float]) -> "Spread":
+        """Of at least one duration."""
+        ms = 1000.0 * np.fromiter(seconds, np.float64)
+        return Spread(float(ms.mean()), float(np.median(ms)), float(np.quantile(ms, 0.95)))
+
+
+@dataclass(frozen=True)
+class Timed:
+    """A system's way through a sequence."""
+
+    T_world_cam: Mapping[int, Pose]
+    """By frame index."""
+    seconds: Sequence[Mapping[str, float]]
+    """Of every frame, by stage: `load` first, `frame` (all of it) last."""
+    lost: int
+    """Frames whose pose is a guess."""
+    finish: float = 0.0
+    """Seconds after the last frame: for what was still being mapped beside it, and the sealing."""
+
+    def milliseconds(self) -> dict[str, Spread]:
+        """By stage, without the first frame, if there are others; a stage takes no time in a frame that skips it."""
+        rows = self.seconds[1:] or self.seconds
+        stages = dict.fromkeys(stage for row in rows for stage in row)
+        return {stage: Spread.of(row.get(stage, 0.0) for row in rows) for stage in stages}
+
+    def ate_cm(self, truth: Mapping[int, Pose]) -> float | None:
+        """Root mean square of the error of position after rigid alignment; None where fewer than three are known."""
+        common = [index for index in self.T_world_cam if index in truth]
+        if len(common) < 3:
+            return None
+        return 100.0 * ate.ate_rmse_of_poses([self.T_world_cam[i] for i in common], [truth[i] for i in common])
+
+
+def command(args: Args, settings: Mapping[str, str]) -> int:
+    """Print a table, and write the file that was asked for."""
+    config = resolved(args.preset, args.config, settings, args.seed)
+    sequence = Part(limit=args.limit).open(args.folder)
+    rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
+    timed = measured(sequence, config, rasterizer)
+    error = timed.ate_cm(sequence.ground_truth())
+    camera = sequence.camera
+    changed = "".join(f", {path} = {value}" for path, value in settings.items())
+    sys.stdout.write(
+        f"{sequence.name}, {camera.width}x{camera.height}, {len(timed.T_world_cam)} frames; {machine()}, a thread on "
+        f"each; {rasterizer.name}, preset {args.preset}{changed}, seed {config.seed}\n{table(timed.milliseconds())}\n"
+        f"ATE {'unknown: fewer than 3 true poses' if error is None else f'{error:.3f} cm, rigid'}; {timed.lost} lost; "
+        f"{1000 * timed.finish:.0f} ms to finish after the last frame\n"
+    )
+    if args.json is not None:
+        written = {
+            "sequence": sequence.name, "width": camera.width, "height": camera.height,
+            "frames": len(timed.T_world_cam), "frames_lost": timed.lost, "ate_rmse_cm": error,
+            "milliseconds": {stage: asdict(spread) for stage, spread in timed.milliseconds().items()},
+            "finish_ms": 1000 * timed.finish, "machine": machine(), "threads": available_cores(),
+            "versions": versions(), "backend": rasterizer.name, "preset": args.preset, "seed": config.seed,
+            "config": to_toml(config),
+        }  # fmt: skip
+        atomic.write_text(args.json, json.dumps(written, indent=2, allow_nan=False) + "\n")
+    return 0
+
+
+def measured(sequence: datasets.Sequence, config: SlamConfig, rasterizer: Rasterizer) -> Timed:
+    """SLAM through a whole sequence, once its kernels are compiled, timed frame by frame."""
+    torch.set_num_threads(1)  # as `recorded` does, which says why
+    compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some ten seconds"))
+    slam, lost = Slam(config, rasterizer), 0
+    seconds: list[Mapping[str, float]] = []
+    with RunProgress(len(sequence)) as progress:
+        for frame, waited in waiting(sequence):
+            started = time.perf_counter()
+            report = slam.step(frame)
+            stepped = time.perf_counter() - started
+            seconds.append({"load": waited, **report.seconds, "frame": waited + stepped})
+            lost += not report.tracked.converged
+            progress.observe(report)
+    started = time.perf_counter()
+    slam.finish()
+    finish = time.perf_counter() - started
+    world = slam.trajectory.world(slam.atlas)
+    poses = {row.frame_index: T for row, T in zip(slam.trajectory.rows, world, strict=True)}
+    return Timed(poses, seconds, lost, finish)
+
+
+def waiting(frames: Iterable[Frame]) -> Iterator[tuple[Frame, float]]:
+    """Each frame with the seconds that its reader was waited for."""
+    reader = iter(frames)
+    while True:
+        started = time.perf_counter()
+        frame = next(reader, None)
+        if frame is None:
+            return
+        yield frame, time.perf_counter() - started
+
+
+def table(milliseconds: Mapping[str, Spread]) -> str:
+    """A line a stage."""
+    head = f"{'milliseconds':<14}{'mean':>9}{'median':>9}{'95 %':>9}"
+    rows = (f"{stage:<14}{s.mean:>9.2f}{s.median:>9.2f}{s.percentile_95:>9.2f}" for stage, s in milliseconds.items())
+    return "\n".join((head, *rows))
