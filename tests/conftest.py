@@ -46,5 +46,5 @@ def corner(rasterizer: Rasterizer) -> Submap:
     config = MapperConfig(seeding=seeding, first_iterations=30, depth_mode="planar", min_opacity=0.1)
     mapper = Mapper(config, ConfidenceConfig(), rasterizer, IdSource(), torch.Generator().manual_seed(0))
     frame = Room().frame()
-    mapped = mapper.map(frame, se3.identity(), Submap.anchored(se3.identity(), index=0))
+    mapped = mapper.optimized(mapper.grown(frame, se3.identity(), Submap.anchored(se3.identity(), index=0)))
     return judged(mapped, frame, ConfidenceConfig(), "planar")

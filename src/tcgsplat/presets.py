@@ -123,6 +123,7 @@ _PUBLISHED: tuple[tuple[str, _Three, Origin, str], ...] = (
     ("mapper.max_keyframes", _same(0), "base", "every mapped frame of a submap stays"),
     ("mapper.sh_degree", _same(0), "base", "colour does not depend on the view"),
     ("schedule.map_every", (5, 1, 1), "base", "map_every"),
+    ("schedule.map_lag", _same(0), "paper", "tracking waits for mapping"),
     ("schedule.submap_by", ("motion", "motion", "interval"), "paper", "Section 4.1"),
     ("schedule.submap_distance", _same(0.5), "paper", "metres; Section 4.1"),
     ("schedule.submap_angle", _same(50.0), "paper", "degrees; Section 4.1"),

@@ -1,11 +1,14 @@
 """RGB-D SLAM over local Gaussian submaps with temporal confidence: Section 3.1 of the paper. Read this file first.
 
-A frame travels one way: tracked pose, perhaps a new submap, mapped submap, judged submap, report. Nothing flows back
-except through the submap. Files, progress and pictures are made by whoever consumes the reports.
+A frame travels one way: synchronised, tracked, perhaps a new submap, perhaps grown into the map. The map is then
+optimised and judged on a thread of its own while the next frames are tracked, and comes into use a fixed number of
+frames later: what a run gives does not depend on how fast either thread was. Nothing flows back except through the
+submap. Files, progress and pictures are made by whoever consumes the reports.
 """
 
 import time
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +16,7 @@ import torch
 from tcgsplat.config import SlamConfig
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.feedback import judged
-from tcgsplat.mapping.mapper import Mapped, Mapper
+from tcgsplat.mapping.mapper import Grown, Mapper
 from tcgsplat.mapping.schedule import Schedule
 from tcgsplat.mapping.seeding import IdSource
 from tcgsplat.render.protocol import Rasterizer
@@ -22,7 +25,22 @@ from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory
 from tcgsplat.tracking.motion import ConstantVelocity
+from tcgsplat.tracking.synchronization import synchronized
 from tcgsplat.tracking.tracker import Tracked, Tracker
+
+
+@dataclass(frozen=True)
+class MapUpdate:
+    """What one mapping update did."""
+
+    frame_index: int
+    """Of the frame that it was made for."""
+    seeded: int
+    pruned: int
+    loss: float
+    """Eq. 21 at the last step."""
+    seconds: float
+    """Of optimising and judging, beside tracking."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +50,10 @@ class StepReport:
     frame_index: int
     tracked: Tracked
     """Its pose is in the submap that was active when the frame came: in `sealed`, where that is given."""
-    mapped: Mapped | None
-    """None where the frame was not mapped. Holds the submap with its keyframes: read it, do not keep it."""
+    mapped: bool
+    """Whether the frame began a mapping update."""
+    update: MapUpdate | None
+    """The mapping update, of an earlier frame as a rule, that came into use with this frame."""
     sealed: Submap | None
     """The submap that this frame ended: to be written down, since SLAM forgets it now."""
     submap_index: int
@@ -41,7 +61,7 @@ class StepReport:
     gaussians: int
     """In the active submap."""
     seconds: Mapping[str, float]
-    """Wall time by stage: track, map."""
+    """Wall time by stage: waiting for the map, tracking, growing the map."""
 
 
 class Slam:
@@ -54,6 +74,8 @@ class Slam:
         self._tracker = Tracker(config.tracker, config.confidence, rasterizer)
         self._mapper = Mapper(config.mapper, config.confidence, rasterizer, IdSource(), generator)
         self._schedule = Schedule(config.schedule)
+        self._mapping_thread = ThreadPoolExecutor(1, thread_name_prefix="mapping")
+        self._updating: Future[tuple[Submap, MapUpdate]] | None = None
         self.motion = ConstantVelocity()
         self.submap = self._anchored(se3.identity(), index=0)
         self.atlas = Atlas().with_submap(self.submap.T_world_map)
@@ -61,51 +83,90 @@ class Slam:
 
     def step(self, frame: Frame) -> StepReport:
         """Track, perhaps switch submap, perhaps map; the first frame's camera is the origin of the world."""
-        frame, mapped, sealed = frame.to(self._device), None, None
-        started = time.perf_counter()
+        frame, sealed, clock = frame.to(self._device), None, _Laps()
+
+        # The map that was optimised meanwhile comes into use, after as many frames on a slow machine as on a fast one.
+        update = self._finished_update() if self._schedule.adopts(frame.index, self.submap) else None
+        clock.lap("wait")
 
         # Track: the map stands still, only the camera moves (equations 17 to 19).
-        tracked = self._tracker.track(frame, self.submap, guess=self.motion.predict(frame.timestamp))
+        together = synchronized(frame, self.motion.velocity)
+        tracked = self._tracker.track(together, self.submap, guess=self.motion.predict(frame.timestamp))
         T_map_cam = tracked.T_map_cam
         advance = self.motion.advanced if tracked.converged else self.motion.coasted
         self.motion = advance(T_map_cam, frame.timestamp)
-        tracked_at = time.perf_counter()
+        clock.lap("track")
 
         # Switch: seal the submap and anchor the next one at this camera (equation 16).
         if tracked.converged and self._schedule.switches_submap(frame.index, T_map_cam, self.submap):
+            update = self._finished_update() or update
+            clock.lap("wait")
             sealed = self.submap.sealed(self.config.confidence)
             self.submap = self._anchored(self.submap.T_world_map @ T_map_cam, index=len(self.atlas))
             self.atlas = self.atlas.with_submap(self.submap.T_world_map)
             self.motion, T_map_cam = self.motion.rebased(), se3.identity()
 
-        # Map: grow where the view is new, optimise (equations 20 to 24), judge what moved (equations 4 to 15).
-        if tracked.converged and self._schedule.maps(frame.index, self.submap):
-            mapped = self._mapper.map(frame, T_map_cam, self.submap)
-            self.submap = judged(mapped, frame, self.config.confidence, self.config.mapper.depth_mode)
+        # Map: grow where the view is new, and have it all optimised and judged while the next frames are tracked.
+        maps = tracked.converged and self._schedule.maps(frame.index, self.submap)
+        if maps:
+            update = self._finished_update() or update
+            clock.lap("wait")
+            grown = self._mapper.grown(synchronized(frame, self.motion.velocity), T_map_cam, self.submap)
+            self.submap = grown.submap
+            self._updating = self._mapping_thread.submit(self._updated, grown)
+            clock.lap("grow")
+            if self.config.schedule.map_lag == 0:
+                update = self._finished_update()
+                clock.lap("wait")
 
-        self.trajectory = self.trajectory.with_row(
-            TrackedPose(
-                frame.index,
-                frame.timestamp,
-                self.submap.index,
-                T_map_cam,
-                lost=not tracked.converged,
-                mapped=mapped is not None,
-            )
+        row = TrackedPose(
+            frame.index, frame.timestamp, self.submap.index, T_map_cam, lost=not tracked.converged, mapped=maps
         )
+        self.trajectory = self.trajectory.with_row(row)
         return StepReport(
             frame_index=frame.index,
             tracked=tracked,
-            mapped=mapped,
+            mapped=maps,
+            update=update,
             sealed=sealed,
             submap_index=self.submap.index,
             gaussians=len(self.submap),
-            seconds={"track": tracked_at - started, "map": time.perf_counter() - tracked_at},
+            seconds=clock.seconds,
         )
 
     def finish(self) -> Submap | None:
         """The last submap, sealed like all others, or None if nothing was ever mapped."""
+        self._finished_update()
         return self.submap.sealed(self.config.confidence) if self.submap.keyframes else None
+
+    def _updated(self, grown: Grown) -> tuple[Submap, MapUpdate]:
+        """Optimise (equations 20 to 24), then judge what moved (equations 4 to 15); runs beside tracking."""
+        started = time.perf_counter()
+        mapped = self._mapper.optimized(grown)
+        submap = judged(mapped, grown.frame, self.config.confidence, self.config.mapper.depth_mode)
+        seconds = time.perf_counter() - started
+        return submap, MapUpdate(grown.frame.index, grown.seeded, mapped.pruned, mapped.loss, seconds)
+
+    def _finished_update(self) -> MapUpdate | None:
+        """Wait for the update that is under way, if any, and use its map from now on."""
+        if self._updating is None:
+            return None
+        self.submap, update = self._updating.result()
+        self._updating = None
+        return update
 
     def _anchored(self, T_world_map: torch.Tensor, index: int) -> Submap:
         return Submap.anchored(T_world_map, index, self.config.mapper.sh_degree, self._device)
+
+
+class _Laps:
+    """Wall time by stage."""
+
+    def __init__(self) -> None:
+        self.seconds = {"wait": 0.0, "track": 0.0, "grow": 0.0}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage] += now - self._last
+        self._last = now

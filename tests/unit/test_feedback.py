@@ -32,8 +32,6 @@ def update(
         before=submap.gaussians if before is None else before,
         submap=mapped,
         rendering=render_view(mapped, frame.camera, T_map_cam, rasterizer),
-        seeded=0,
-        pruned=0,
         loss=0.0,
     )
 

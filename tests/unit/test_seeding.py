@@ -40,6 +40,10 @@ def plane(degrees_x: float = 0.0, degrees_y: float = 0.0, distance: float = 1.5)
     return frame, normal / normal.norm()
 
 
+def normals_of(depth: Tensor) -> Tensor:
+    return surface_normals(depth, CAMERA, torch.ones_like(depth, dtype=torch.bool)).reshape(*depth.shape, 3)
+
+
 def seeded(
     frame: Frame,
     config: SeedingConfig,
@@ -109,7 +113,7 @@ class TestNormals:
     @pytest.mark.parametrize(("x", "y"), [(0, 0), (30, 0), (0, -45), (35, 25), (-40, 30)])
     def test_of_a_tilted_plane_up_to_the_border(self, x: float, y: float) -> None:
         frame, normal = plane(x, y)
-        normals = surface_normals(frame.depth, CAMERA)
+        normals = normals_of(frame.depth)
         assert degrees_between(normals, normal)[1:-1, 1:-1].max() < 0.2
         torch.testing.assert_close(normals.norm(dim=-1), torch.ones_like(frame.depth))
 
@@ -118,14 +122,14 @@ class TestNormals:
         frame, normal = plane(35, 25)
         hole = torch.zeros_like(frame.valid)
         hole[20:28, 30:50] = True
-        off = degrees_between(surface_normals(torch.where(hole, 0.0, frame.depth), CAMERA), normal)
+        off = degrees_between(normals_of(torch.where(hole, 0.0, frame.depth)), normal)
         touching = torch.nn.functional.max_pool2d(hole[None].float(), 3, stride=1, padding=1)[0] > 0
         assert off[1:-1, 1:-1][~touching[1:-1, 1:-1]].max() < 0.2
 
     def test_of_noisy_depth(self, generator: torch.Generator) -> None:
         frame, normal = plane(30, 10)
         noisy = frame.depth + 0.003 * torch.randn(frame.depth.shape, generator=generator)
-        off = degrees_between(surface_normals(noisy, CAMERA), normal)[1:-1, 1:-1]
+        off = degrees_between(normals_of(noisy), normal)[1:-1, 1:-1]
         rim = torch.ones_like(off, dtype=torch.bool)
         rim[1:-1, 1:-1] = False
         raw_slope = math.degrees(0.003 * 2**0.5 / (2 * 1.5 / CAMERA.fx))  # what the noise does to one difference
@@ -136,11 +140,11 @@ class TestNormals:
         frame, normal = plane(20, 0)
         depth = frame.depth.clone()
         depth[:, 40:] += 0.5
-        off = degrees_between(surface_normals(depth, CAMERA)[:, 1:-1], normal)[1:-1]
+        off = degrees_between(normals_of(depth)[:, 1:-1], normal)[1:-1]
         assert off[:, :38].max() < 0.2  # up to the two columns whose differences reach over the edge
 
     def test_face_the_camera_wherever_they_are_known(self, room: Room) -> None:
-        normals = surface_normals(room.frame(pose(degrees=(20, 70, 5))).depth, CAMERA)
+        normals = normals_of(room.frame(pose(degrees=(20, 70, 5))).depth)
         assert ((normals * CAMERA.rays()).sum(dim=-1) < 0).all()
 
 

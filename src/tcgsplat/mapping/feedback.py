@@ -23,7 +23,9 @@ def observation(mapped: Mapped, frame: Frame, config: ConfidenceConfig, depth_mo
     """
     submap, rendering = mapped.submap, mapped.rendering
     after = submap.gaussians
-    before = mapped.before.kept(torch.isin(mapped.before.ids, after.ids))
+    before = mapped.before
+    if mapped.pruned:
+        before = before.picked(torch.searchsorted(before.ids, after.ids))  # ids only ever grow along the rows
 
     points = se3.transform(se3.inverse(submap.keyframes[-1].T_map_cam), after.means)
     pixels = frame.camera.project(torch.cat((points[:, :2], points[:, 2:].clamp_min(1e-6)), dim=1))

@@ -18,19 +18,38 @@ from tcgsplat.tensors import Pose
 
 
 @dataclass(frozen=True)
+class Grown:
+    """A submap that has taken in a frame, and is to be optimised."""
+
+    submap: Submap
+    """With seeds where the frame showed something new, and the frame as its newest keyframe."""
+    seeded: int
+    first: bool
+    """It is the submap's first frame."""
+
+    @property
+    def frame(self) -> Frame:
+        """The frame that was taken in."""
+        return self.submap.keyframes[-1].frame
+
+
+@dataclass(frozen=True)
 class Mapped:
-    """What one mapping update did."""
+    """What optimising a grown submap did."""
 
     before: Gaussians
     """The Gaussians after seeding, before the first step."""
     submap: Submap
-    """Optimised and pruned, with the frame as its newest keyframe; confidence not yet judged."""
+    """Optimised and pruned; confidence not yet judged."""
     rendering: Rendering
-    """The frame's view of the optimised submap."""
-    seeded: int
-    pruned: int
+    """The newest keyframe's view of the optimised submap."""
     loss: float
     """Eq. 21 at the last step."""
+
+    @property
+    def pruned(self) -> int:
+        """How many Gaussians became too faint."""
+        return len(self.before) - len(self.submap)
 
 
 class Mapper:
@@ -50,25 +69,22 @@ class Mapper:
         self._ids = ids
         self._generator = generator
 
-    def map(self, frame: Frame, T_map_cam: Pose, submap: Submap) -> Mapped:
-        """One mapping update with `frame` at `T_map_cam`."""
-        config = self._config
+    def grown(self, frame: Frame, T_map_cam: Pose, submap: Submap) -> Grown:
+        """The submap with `frame`, at `T_map_cam`, taken in."""
         first = not submap.keyframes
         rendering = None if first else render_view(submap, frame.camera, T_map_cam, self._rasterizer)
-        seeds = seed(frame, T_map_cam, rendering, submap.gaussians, self._ids, self._generator, config.seeding)
-        keyframes = thinned((*submap.keyframes, Keyframe(frame, T_map_cam)), config.max_keyframes)
+        seeds = seed(frame, T_map_cam, rendering, submap.gaussians, self._ids, self._generator, self._config.seeding)
+        keyframes = thinned((*submap.keyframes, Keyframe(frame, T_map_cam)), self._config.max_keyframes)
         grown = replace(submap.grown(seeds, self._confidence), keyframes=keyframes)
+        return Grown(grown, len(seeds), first)
 
-        iterations = config.first_iterations if first else config.iterations
-        optimized, loss = self._optimized(grown, iterations)
-        return Mapped(
-            before=grown.gaussians,
-            submap=optimized,
-            rendering=render_view(optimized, frame.camera, T_map_cam, self._rasterizer),
-            seeded=len(seeds),
-            pruned=len(grown) - len(optimized),
-            loss=loss,
-        )
+    def optimized(self, grown: Grown) -> Mapped:
+        """The grown submap, optimised over its keyframes."""
+        iterations = self._config.first_iterations if grown.first else self._config.iterations
+        submap, loss = self._optimized(grown.submap, iterations)
+        newest = submap.keyframes[-1]
+        rendering = render_view(submap, newest.frame.camera, newest.T_map_cam, self._rasterizer)
+        return Mapped(grown.submap.gaussians, submap, rendering, loss)
 
     def _optimized(self, submap: Submap, iterations: int) -> tuple[Submap, float]:
         """Adam over drawn keyframes; faint Gaussians are dropped halfway and at the end."""

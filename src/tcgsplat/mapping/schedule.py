@@ -16,6 +16,10 @@ class ScheduleConfig:
 
     map_every: int = 5
     """Frames from one mapping update to the next; the first frame of a submap is always mapped. [base: Replica 5]"""
+    map_lag: int = 5
+    """Frames after which tracking uses what a mapping update made, while the update is worked on beside tracking; 0:
+    at once, as the paper has it, with tracking waiting. No later than the next update begins. What is seeded is
+    tracked against at once in any case. [ours]"""
     submap_by: Literal["motion", "interval"] = "motion"
     """What ends a submap: camera motion since its first frame, or a number of frames. [paper]"""
     submap_distance: float = 0.5
@@ -29,6 +33,8 @@ class ScheduleConfig:
         for name in ("map_every", "submap_distance", "submap_angle", "submap_interval"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"schedule.{name} is {getattr(self, name)!r}; it must be above 0")
+        if self.map_lag < 0:
+            raise ConfigError(f"schedule.map_lag is {self.map_lag!r}; it must be at least 0")
         if self.submap_by not in ("motion", "interval"):
             raise ConfigError(f"schedule.submap_by is {self.submap_by!r}; choose motion or interval")
 
@@ -53,3 +59,7 @@ class Schedule:
         if not submap.keyframes or len(submap) == 0:
             return True
         return frame_index - submap.keyframes[-1].frame.index >= self.config.map_every
+
+    def adopts(self, frame_index: int, submap: Submap) -> bool:
+        """Whether from this frame on tracking uses what the newest mapping update made."""
+        return bool(submap.keyframes) and frame_index - submap.keyframes[-1].frame.index >= self.config.map_lag

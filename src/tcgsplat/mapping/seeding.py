@@ -18,6 +18,7 @@ from torch import Tensor
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import quaternion, se3
 from tcgsplat.geometry.camera import Camera
+from tcgsplat.mapping.seeding_kernels import normals_at
 from tcgsplat.render.view import Rendering
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import SH_C0, Gaussians
@@ -80,28 +81,12 @@ class IdSource:
         return ids
 
 
-def surface_normals(depth: Plane, camera: Camera) -> Float[Tensor, "h w 3"]:
-    """Unit normals of a depth image in the camera frame, towards the camera; the viewing ray's where unknown.
-
-    Points are averaged over 5 x 5 readings first, where that moves them by less than 3 % of the depth: noise is an
-    order larger than the slope between two pixels. Points, not depths: where a window hangs over a border or a hole,
-    its average still lies on the plane of its points.
-    """
-    rays = camera.rays()
-    measured = rays * depth[..., None]
-    layers = torch.cat((measured, (depth > 0).float()[..., None]), dim=-1).permute(2, 0, 1)[:, None]
-    sums = torch.nn.functional.conv2d(layers, torch.ones(1, 1, 5, 5), padding=2)[:, 0]
-    mean = (sums[:3] / sums[3].clamp_min(1.0)).permute(1, 2, 0)
-    one_surface = (depth > 0) & ((mean[..., 2] - depth).abs() < 0.03 * depth)
-    points = torch.where(one_surface[..., None], mean, measured)
-    du = points[1:-1, 2:] - points[1:-1, :-2]
-    dv = points[2:, 1:-1] - points[:-2, 1:-1]
-    inner = torch.nn.functional.normalize(torch.linalg.cross(dv, du), dim=-1)
-    normals = torch.nn.functional.pad(inner.permute(2, 0, 1), (1, 1, 1, 1)).permute(1, 2, 0)
-    facing = -(normals * torch.nn.functional.normalize(rays, dim=-1)).sum(dim=-1)
-    neighbors = torch.nn.functional.max_pool2d(-layers[3], 3, stride=1, padding=1)[0] < 0  # all nine have one
-    known = neighbors & (facing > 0.15)
-    return torch.where(known[..., None], normals, -torch.nn.functional.normalize(rays, dim=-1))
+def surface_normals(depth: Plane, camera: Camera, chosen: Mask) -> Float[Tensor, "n 3"]:
+    """Unit normals of a depth image at the chosen pixels, row by row, in the camera frame; see `normals_at`."""
+    rows, columns = np.nonzero(chosen.numpy())
+    rays_x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
+    rays_y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
+    return torch.from_numpy(normals_at(np.ascontiguousarray(depth.numpy()), rows, columns, rays_x, rays_y))
 
 
 def needed(frame: Frame, rendering: Rendering | None, config: SeedingConfig) -> Mask:
@@ -175,8 +160,8 @@ def _surface_seeds(
     height, width = mask.shape
     chosen = mask & _lattice(height, width, config.spacing)
     depth = frame.depth[chosen]
-    points = (frame.camera.rays() * frame.depth[..., None])[chosen] * (1 + config.push_back)
-    normals = surface_normals(frame.depth, frame.camera)[chosen]
+    points = frame.camera.rays()[chosen] * depth[:, None] * (1 + config.push_back)
+    normals = surface_normals(frame.depth, frame.camera, chosen)
     rays = torch.nn.functional.normalize(points, dim=-1)
     facing = -(normals * rays).sum(dim=-1).clamp(-1.0, -0.0)  # cosine between normal and viewing direction, >= 0
 

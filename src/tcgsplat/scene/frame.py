@@ -26,6 +26,13 @@ class Frame:
     valid: Mask
     """Pixels that saw the world: false on the border that undistortion leaves empty."""
     camera: Camera
+    depth_timestamp: float | None = None
+    """Seconds, of the depth image on the clock of the colour image's stamp; None where both are of one instant."""
+
+    @property
+    def depth_delay(self) -> float:
+        """Seconds from the colour image to the depth image; negative where depth came first."""
+        return 0.0 if self.depth_timestamp is None else self.depth_timestamp - self.timestamp
 
     def to(self, device: torch.device) -> "Frame":
         """The same frame on another device; itself if it is there already."""
