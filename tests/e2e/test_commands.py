@@ -95,8 +95,9 @@ def test_run_is_quiet_in_a_pipe_and_leaves_a_whole_run(finished: subprocess.Comp
     summary = run.summary()
     assert (summary["frames"], summary["frames_lost"], summary["submaps"]) == (FRAMES, 0, 3)
     assert (summary["backend"], summary["preset"], summary["interrupted"]) == ("numba", "default", False)
-    for name in ("seconds", "ms_per_frame", "ms_per_frame_median", "ms_track", "ms_map", "peak_rss_mb"):
+    for name in ("seconds", "ms_per_frame", "ms_per_frame_median", "peak_rss_mb"):
         assert summary[name] > 0, name
+    assert 0 < summary["stage_ms"]["track"] < summary["ms_per_frame"]
     asked = {"schedule.submap_by": "interval", "schedule.submap_interval": 8}
     assert from_toml(run.config_toml) == with_settings(SlamConfig(), asked)
 
@@ -191,6 +192,45 @@ def test_the_ground_truth_plays_no_part_in_a_run(
     assert main(["eval", str(tmp_path / "run")]) == (0 if poison == "absent" else 1)
     said = capsys.readouterr()
     assert "no ground truth" in said.out if poison == "absent" else "groundtruth.txt" in said.err
+
+
+def test_a_run_in_real_time_tells_what_it_dropped(room_folder: Path, tmp_path: Path):
+    out = tmp_path / "live"
+    work = ["--mapper.iterations", "60", "--schedule.map_every", "1"]  # more than a camera leaves time for
+    done = tcgsplat("run", room_folder, *work, "--realtime", "--out", out)
+    assert done.returncode == 0, done.stderr
+    summary = RunDirectory.open(out).summary()
+    trajectory, _ = RunDirectory.open(out).trajectory()
+    used = [row.frame_index for row in trajectory.rows]
+    assert summary["realtime"] is True
+    assert used == sorted(set(used)) and used[0] == 0 and used[-1] == FRAMES - 1
+    assert len(used) == summary["frames"] == FRAMES - summary["frames_dropped"] < FRAMES
+    assert summary["frames_total"] == FRAMES
+    assert 0 < summary["ms_late_median"] <= summary["ms_late_p95"]
+    assert summary["seconds"] > (FRAMES - 1) / 30
+    assert f"; {FRAMES - len(used)} of {FRAMES} frames dropped (" in done.stdout
+    assert main(["eval", str(out)]) == 0
+
+
+def test_waiting_for_the_camera_can_be_stopped_and_is_not_work(room_folder: Path, tmp_path: Path):
+    data = Path(shutil.copytree(room_folder, tmp_path / "room"))
+    for name in ("rgb", "depth"):
+        rows = (data / f"{name}.txt").read_text().splitlines()[:6]
+        later = [f"{float(row.split()[0]) + 1000.0:.6f} {row.split()[1]}" for row in rows[3:]]
+        (data / f"{name}.txt").write_text("\n".join(rows[:3] + later) + "\n")
+    out = tmp_path / "stopped"
+    arguments = line("run", data, "--realtime", "--out", out)
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    waiting = process.stderr.readline()
+    assert "warning: frame 3 comes " in waiting and waiting.endswith(" s after the one before: waiting\n")
+    process.send_signal(signal.SIGINT)
+    _, complaints = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    assert "tcgsplat: stopped; saved " in complaints
+    summary = RunDirectory.open(out).summary()
+    assert (summary["interrupted"], summary["frames_total"]) == (True, 3)
+    assert RunDirectory.open(out).submap_count == 1
 
 
 def started(room: Path, out: Path) -> subprocess.Popen[str]:

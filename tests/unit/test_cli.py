@@ -214,7 +214,7 @@ def test_the_first_frame_does_not_count_in_times():
     assert (result.frames, result.frames_lost, result.submaps, result.gaussians) == (4, 1, 2, 30)
     assert result.ms_per_frame == pytest.approx(70.0)
     assert result.ms_per_frame_median == pytest.approx(40.0)
-    assert (result.ms_track, result.ms_map) == pytest.approx((20.0, 40.0))
+    assert result.stage_ms == pytest.approx({"track": 20.0, "map": 40.0})
     assert str(result) == "4 frames in 21.0 s (70 ms a frame), 1 lost, 2 submaps, 30 Gaussians"
     assert json.loads(json.dumps(result.to_dict()))["versions"]["torch"] == torch.__version__
     assert 50 < (result.peak_rss_mb or 0) < 100_000

@@ -20,7 +20,7 @@ WINDOW = 30
 
 
 class RunProgress:
-    """One live line on standard error, if that is a terminal: frame, rate, submap, Gaussians, lost frames, time left.
+    """One live line on standard error, if that is a terminal: frame, rate, submap, Gaussians, frames lost, time left.
 
     Where tracking was lost and found again is logged as a warning.
     """
@@ -41,6 +41,7 @@ class RunProgress:
         self._frames = frames
         self._times = deque([time.perf_counter()], maxlen=WINDOW + 1)
         self._lost = 0
+        self._dropped = 0
         self._lost_since: int | None = None
 
     def __enter__(self) -> "RunProgress":
@@ -52,17 +53,19 @@ class RunProgress:
     ) -> None:
         self._bar.stop()
 
-    def observe(self, report: StepReport) -> None:
-        """Show what one more frame did."""
+    def observe(self, report: StepReport, dropped: int = 0) -> None:
+        """Show what one more frame did, and how many were dropped before it."""
         self._warn(report)
+        self._dropped += dropped
         self._times.append(time.perf_counter())
         rate = (len(self._times) - 1) / (self._times[-1] - self._times[0])
-        lost = f"  {self._lost} lost" if self._lost else ""
+        missed = {"lost": self._lost, "dropped": self._dropped}
+        counts = "".join(f"  {count} {what}" for what, count in missed.items() if count)
         self._bar.update(
             self._task,
             completed=report.frame_index + 1,
             description=f"frame {report.frame_index + 1}/{self._frames}",
-            state=f"{rate:.1f} fps  submap {report.submap_index}  {report.gaussians} Gaussians{lost} ",
+            state=f"{rate:.1f} fps  submap {report.submap_index}  {report.gaussians} Gaussians{counts} ",
         )
 
     def _warn(self, report: StepReport) -> None:

@@ -1,6 +1,7 @@
 """A SLAM run, written down as it goes."""
 
 import json
+import logging
 import shlex
 import shutil
 import signal
@@ -8,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -19,12 +20,17 @@ from tcgsplat.cli.progress import RunProgress, say
 from tcgsplat.cli.summary import Summary, Tally
 from tcgsplat.config import SlamConfig, to_toml
 from tcgsplat.datasets import Sequence, open_sequence
+from tcgsplat.datasets.playback import Arrival, Clock, in_turn, play
 from tcgsplat.errors import ArchiveError
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.scene.frame import Frame
 from tcgsplat.slam import Slam, StepReport
 from tcgsplat.storage import atomic
 from tcgsplat.storage.run_directory import RunDirectory
+
+logger = logging.getLogger(__name__)
+
+MAX_HELD = 0.01
+"""Share of a real-time run in which reading may have stopped the camera's clock without a word about it."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +86,24 @@ def begin(path: Path, config: SlamConfig, folder: Path, part: Part, *, overwrite
     return run
 
 
-def recorded(sequence: Sequence, config: SlamConfig, rasterizer: Rasterizer, run: RunDirectory, preset: str) -> Summary:
+def recorded(
+    sequence: Sequence,
+    config: SlamConfig,
+    rasterizer: Rasterizer,
+    run: RunDirectory,
+    preset: str,
+    *,
+    realtime: bool = False,
+) -> Summary:
     """A whole run with progress on the terminal; its summary is on disk too.
+
+    Args:
+        sequence: The frames.
+        config: Settings of the system.
+        rasterizer: Its backend.
+        run: Where to write.
+        preset: What the settings started from, for the summary.
+        realtime: Play the frames at the pace of their time stamps and drop those that come too fast.
 
     Raises:
         KeyboardInterrupt: at the second Ctrl-C, saying what is on disk.
@@ -93,50 +115,61 @@ def recorded(sequence: Sequence, config: SlamConfig, rasterizer: Rasterizer, run
         config, rasterizer, lambda: say("compiling kernels, once per machine: some ten seconds")
     )
     try:
-        with RunProgress(len(sequence)) as progress, stopping_on_interrupt() as stop:
-            summary = record(Slam(config, rasterizer), sequence, run, progress.observe, stop.is_set)
+        with (
+            RunProgress(len(sequence)) as progress,
+            stopping_on_interrupt() as stop,
+            # `stop.wait`, so that nobody has to wait for the camera's next frame when the run is to stop
+            closing(play(sequence, Clock(sleep=stop.wait)) if realtime else in_turn(sequence)) as arrivals,
+        ):
+            summary = record(Slam(config, rasterizer), arrivals, run, progress.observe, stop.is_set)
     except KeyboardInterrupt as interrupt:
         saved = f"{run.submap_count} submaps sealed before are saved"
         raise KeyboardInterrupt(f"stopped at once; {saved}: {run.path}") from interrupt
-    summary = replace(summary, seconds_compiling=compiling, backend=rasterizer.name, preset=preset)
+    summary = replace(summary, realtime=realtime, seconds_compiling=compiling, backend=rasterizer.name, preset=preset)
+    if summary.seconds_held > MAX_HELD * summary.seconds:
+        logger.warning(
+            "the images could not be read fast enough: for %.1f of %.1f s the playback stood still, as no camera would",
+            summary.seconds_held, summary.seconds,
+        )  # fmt: skip
     run.write_summary(summary.to_dict())
     return summary
 
 
 def record(
     slam: Slam,
-    frames: Iterable[Frame],
+    arrivals: Iterable[Arrival],
     run: RunDirectory,
-    observe: Callable[[StepReport], object],
+    observe: Callable[[StepReport, int], object],
     stopped: Callable[[], bool],
 ) -> Summary:
     """Step SLAM through the frames; each sealed submap and the path so far are on disk before the next frame.
 
     Args:
         slam: A fresh system.
-        frames: In order of time.
+        arrivals: Frames in order of time.
         run: Where to write.
-        observe: Called with every report.
+        observe: Called with every report, and the number of frames dropped before it.
         stopped: Asked after every frame; if true, what there is gets sealed and the run ends.
 
     Returns:
         The summary, not yet written: the caller knows more about the run.
     """
-    tally, gaussians, stop = Tally(), 0, False
+    tally, gaussians = Tally(), 0
     started = before = time.perf_counter()
-    for frame in frames:
-        report = slam.step(frame)
+    for arrival in arrivals:
+        report = slam.step(arrival.frame)
+        tally.follow(arrival, time.perf_counter())
         if report.sealed is not None:
             run.write_submap(report.sealed)
             run.write_trajectory(slam.trajectory, slam.atlas)
             gaussians += len(report.sealed)
-        observe(report)
+        observe(report, arrival.dropped)
         now = time.perf_counter()
-        tally.count(report, now - before)
+        tally.count(report, now - before - arrival.waited)
         before = now
-        stop = stopped()
-        if stop:
+        if stopped():
             break
+    interrupted = stopped()
     last = slam.finish()
     if last is not None:
         run.write_submap(last)
@@ -146,7 +179,7 @@ def record(
         submaps=run.submap_count,
         gaussians=gaussians,
         seconds=time.perf_counter() - started,
-        interrupted=stop,
+        interrupted=interrupted,
     )
 
 

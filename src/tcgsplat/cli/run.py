@@ -18,6 +18,10 @@ class Args:
     Every setting is a flag too, e.g. --mapper.iterations 20 --tracker.solver descent --confidence.guide-mapping false;
     `tcgsplat presets default` lists them. A flag counts more than the file, the file more than the preset. Ctrl-C ends
     the run after the current frame and saves what there is.
+
+    --realtime shows whether this machine keeps up with the camera. While a frame is worked on, newer ones replace
+    older ones; those replaced are counted, and missing in the trajectory. How many that are depends on how fast the
+    machine is at the moment, so the results of two such runs differ.
     """
 
     folder: tyro.conf.Positional[Path]
@@ -38,6 +42,8 @@ class Args:
     """Rasterizer: auto, numba or reference."""
     seed: int | None = None
     """Of all randomness; that of the preset if left out."""
+    realtime: bool = False
+    """Play it by its time stamps, as a live camera: frames that come while the system is busy are dropped."""
     overwrite: bool = False
     """Replace the run directory if there is a run in it."""
     settings: Flags = field(default_factory=dict)
@@ -52,7 +58,7 @@ def command(args: Args) -> int:
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     out = args.out or Path("runs") / sequence.name
     run = begin(out, config, args.folder, part, overwrite=args.overwrite)
-    summary = recorded(sequence, config, rasterizer, run, args.preset)
+    summary = recorded(sequence, config, rasterizer, run, args.preset, realtime=args.realtime)
     if summary.interrupted:
         sys.stderr.write(f"tcgsplat: stopped; saved {summary}: {run.path}\n")
         return 130

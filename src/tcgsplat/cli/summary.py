@@ -7,6 +7,9 @@ from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
+
+from tcgsplat.datasets.playback import Arrival
 from tcgsplat.render.numba_cpu.workers import available_cores
 from tcgsplat.slam import StepReport
 
@@ -26,17 +29,27 @@ class Summary:
     seconds: float
     """Wall time from the first frame's reading to the last file, without compiling the kernels."""
     ms_per_frame: float
-    """Mean over the frames: reading, tracking, mapping, writing."""
+    """Mean over the frames: reading, tracking, mapping, writing; in real time without the wait for the camera."""
     ms_per_frame_median: float
     """Of the same."""
-    ms_track: float
-    """Mean over the frames."""
-    ms_map: float
-    """Mean over all frames, mapped or not."""
+    stage_ms: dict[str, float]
+    """Mean over all frames of each stage of `Slam.step`, by its name."""
     interrupted: bool
     """Stopped by Ctrl-C; what had been seen by then is sealed and saved."""
     peak_rss_mb: float | None
     """Most memory that the process has held, MB of 2^20 bytes; None where the system does not tell."""
+    realtime: bool = False
+    """Played by its time stamps, as from a live camera."""
+    frames_dropped: int = 0
+    """Captured while the system was busy, and replaced by newer ones before it was free."""
+    frames_total: int = 0
+    """Captured until the run ended: used or dropped. Images that cannot be read are not among them."""
+    ms_late_median: float | None = None
+    """From a frame's capture to the end of its step, the first one included; None if not in real time."""
+    ms_late_p95: float | None = None
+    """Of the same: what 95 % of the frames stay below."""
+    seconds_held: float = 0.0
+    """In which the playback stood still, because an image was not decoded yet; a live camera does not wait."""
     seconds_compiling: float = 0.0
     """Before the first frame; next to nothing once the kernels are in numba's cache."""
     backend: str = ""
@@ -51,7 +64,14 @@ class Summary:
         return (
             f"{self.frames} frames in {self.seconds:.1f} s ({self.ms_per_frame:.0f} ms a frame), "
             f"{self.frames_lost} lost, {self.submaps} submap{'s' * (self.submaps != 1)}, {self.gaussians} Gaussians"
+            f"{self._behind() if self.realtime else ''}"
         )
+
+    def _behind(self) -> str:
+        """How the run kept up with the camera."""
+        share = 100 * self.frames_dropped / max(self.frames_total, 1)
+        late = f", {self.ms_late_median:.0f} ms late" if self.ms_late_median is not None else ""
+        return f"; {self.frames_dropped} of {self.frames_total} frames dropped ({share:.1f} %){late}"
 
     def to_dict(self) -> dict[str, object]:
         """For JSON."""
@@ -64,33 +84,57 @@ class Tally:
 
     frames: int = 0
     lost: int = 0
-    ms: dict[str, list[float]] = field(default_factory=lambda: {"frame": [], "track": [], "map": []})
+    dropped: int = 0
+    held: float = 0.0
+    """Seconds."""
+    late: list[float] = field(default_factory=list)
+    """Milliseconds from capture to the end of the step, of each frame that came by its time stamp."""
+    ms: list[float] = field(default_factory=list)
+    """Milliseconds that each frame took."""
+    stage_ms: dict[str, list[float]] = field(default_factory=dict)
+    """Of these, by the stages of `Slam.step`."""
 
     def count(self, report: StepReport, seconds: float) -> None:
-        """Add a report, and the wall time since the one before."""
+        """Add a report, and the wall time that its frame took."""
         self.frames += 1
         self.lost += not report.tracked.converged
-        for stage, duration in {"frame": seconds, **report.seconds}.items():
-            self.ms[stage].append(1000.0 * duration)
+        self.ms.append(1000.0 * seconds)
+        for stage, duration in report.seconds.items():
+            self.stage_ms.setdefault(stage, []).append(1000.0 * duration)
+
+    def follow(self, arrival: Arrival, stepped: float) -> None:
+        """Add how a frame came, and the reading of the clock at the end of its step."""
+        self.dropped += arrival.dropped
+        self.held += arrival.held
+        if arrival.captured is not None:
+            self.late.append(1000.0 * (stepped - arrival.captured))
 
     def summary(self, *, submaps: int, gaussians: int, seconds: float, interrupted: bool) -> Summary:
         """Of the whole run."""
-        warm = {stage: times[1:] or times or [0.0] for stage, times in self.ms.items()}
         return Summary(
             frames=self.frames,
             frames_lost=self.lost,
             submaps=submaps,
             gaussians=gaussians,
             seconds=seconds,
-            ms_per_frame=statistics.fmean(warm["frame"]),
-            ms_per_frame_median=statistics.median(warm["frame"]),
-            ms_track=statistics.fmean(warm["track"]),
-            ms_map=statistics.fmean(warm["map"]),
+            ms_per_frame=statistics.fmean(_warm(self.ms)),
+            ms_per_frame_median=statistics.median(_warm(self.ms)),
+            stage_ms={stage: statistics.fmean(_warm(times)) for stage, times in self.stage_ms.items()},
             interrupted=interrupted,
+            frames_dropped=self.dropped,
+            frames_total=self.frames + self.dropped,
+            ms_late_median=statistics.median(self.late) if self.late else None,
+            ms_late_p95=float(np.percentile(self.late, 95)) if self.late else None,
+            seconds_held=self.held,
             peak_rss_mb=peak_rss_mb(),
             versions=versions(),
             machine=machine(),
         )
+
+
+def _warm(times: list[float]) -> list[float]:
+    """All but the first, if there are any."""
+    return times[1:] or times or [0.0]
 
 
 def peak_rss_mb() -> float | None:
