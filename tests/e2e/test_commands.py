@@ -91,6 +91,8 @@ def test_run_is_quiet_in_a_pipe_and_leaves_a_whole_run(finished: subprocess.Comp
     trajectory, atlas = run.trajectory()
     assert [row.frame_index for row in trajectory.rows] == list(range(FRAMES))
     assert run.submap_count == len(atlas) == 3
+    keyframes = {keyframe.frame.index for i in range(3) for keyframe in run.load_submap(i).keyframes}
+    assert {row.frame_index for row in trajectory.rows if row.mapped} == keyframes == {0, 5, 8, 13, 16, 21}
     assert sum(len(run.load_submap(i)) for i in range(3)) == run.summary()["gaussians"]
     summary = run.summary()
     assert (summary["frames"], summary["frames_lost"], summary["submaps"]) == (FRAMES, 0, 3)
@@ -110,7 +112,8 @@ def test_eval_then_export(run: RunDirectory, capsys: pytest.CaptureFixture[str])
         assert {"value", "unit"} <= report[name].keys() and name in table
     assert report["frames"]["value"] == FRAMES
     assert report["ate_rmse"]["value"] < 1.0 and report["ate_rmse"]["unit"] == "cm"
-    assert report["psnr"]["value"] > 20
+    assert report["psnr"]["value"] > 20 and report["psnr_withheld"]["value"] > 20
+    assert report["coverage_withheld"]["value"] > 90
     for name in ("contact_sheet.png", "trajectory.png"):
         picture = cv2.imread(str(run.path / name))
         assert picture is not None and picture.std() > 10
@@ -160,7 +163,7 @@ def test_eval_without_the_data_says_so_and_goes_on(run: RunDirectory, capsys: py
     assert main(["eval", str(run.path)]) == 0
     assert "warning: /gone/away, the data of the run, is not there" in capsys.readouterr().err
     report = json.loads((run.path / "report.json").read_text())
-    assert "ate_rmse" not in report and report["psnr"]["value"] > 20
+    assert "ate_rmse" not in report and "psnr_withheld" not in report and report["psnr"]["value"] > 20
 
 
 def test_the_same_command_twice_gives_the_same_bytes(

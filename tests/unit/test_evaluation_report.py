@@ -13,6 +13,7 @@ from tcgsplat.confidence.state import ConfidenceState
 from tcgsplat.errors import EvaluationError
 from tcgsplat.evaluation import figures
 from tcgsplat.evaluation.report import Metric, Report, associate, evaluate, score_trajectory
+from tcgsplat.evaluation.views import spread
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.backends import open_rasterizer
@@ -29,6 +30,8 @@ from tcgsplat.tensors import Pose
 CAMERA = Camera(fx=40.0, fy=40.0, cx=23.5, cy=15.5, width=48, height=32)
 OFFSET = 0.05
 """Metres by which the sensor's depth is greater than the map's."""
+COLOR_OFFSET = 0.1
+"""By which the colours of the sequence differ from the map's: 20 dB."""
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +45,8 @@ class Recorded:
 
     frames: tuple[Frame, ...]
     truth: dict[int, Pose] = field(default_factory=dict)
+    asked: list[int] = field(default_factory=list)
+    """Indices of the frames that were read out of turn."""
     name: str = "wall"
     camera: Camera = CAMERA
 
@@ -52,6 +57,7 @@ class Recorded:
         return iter(self.frames)
 
     def frame(self, index: int) -> Frame:
+        self.asked.append(index)
         return self.frames[index]
 
     def ground_truth(self) -> dict[int, Pose]:
@@ -104,7 +110,7 @@ def seen(submap: Submap, index: int, T_map_cam: Pose, rasterizer: Rasterizer) ->
 
 @pytest.fixture
 def run(tmp_path: Path, rasterizer: Rasterizer) -> RunDirectory:
-    """Two submaps, eight frames at 10 cm steps, keyframes 0, 2, 4 and 6; frame 7 is lost and 4 cm off."""
+    """Two submaps, eight frames at 10 cm steps, 0, 2, 4 and 6 mapped and keyframes; frame 7 is lost and 4 cm off."""
     run = RunDirectory.create(tmp_path / "run", config_toml="", sequence="/data/wall")
     atlas = Atlas((at(0.0), at(0.4)))
     rows = []
@@ -113,7 +119,8 @@ def run(tmp_path: Path, rasterizer: Rasterizer) -> RunDirectory:
         for i in range(4):
             T_map_cam = at(0.1 * i, 0.04 if index == 1 and i == 3 else 0.0)
             frame_index = 4 * index + i
-            rows.append(TrackedPose(frame_index, 100.0 + frame_index / 30, index, T_map_cam, lost=frame_index == 7))
+            stamp, lost = 100.0 + frame_index / 30, frame_index == 7
+            rows.append(TrackedPose(frame_index, stamp, index, T_map_cam, lost=lost, mapped=i % 2 == 0))
             if i % 2 == 0:
                 keyframe = seen(submap, frame_index, T_map_cam, rasterizer)
                 submap = replace(submap, keyframes=(*submap.keyframes, keyframe))
@@ -124,14 +131,19 @@ def run(tmp_path: Path, rasterizer: Rasterizer) -> RunDirectory:
 
 
 @pytest.fixture
-def sequence(run: RunDirectory) -> Recorded:
-    """The truth is the estimate without its error, in another world frame; frame 3 has none."""
-    frames = tuple(
-        Frame(i, 100.0 + i / 30, torch.zeros(4, 4, 3), torch.zeros(4, 4), torch.ones(4, 4, dtype=torch.bool), CAMERA)
-        for i in range(8)
-    )
+def sequence(run: RunDirectory, rasterizer: Rasterizer) -> Recorded:
+    """The truth is the estimate without its error, in another world frame; frame 3 has none.
+
+    All colours are off by `COLOR_OFFSET`, but for the keyframes' own images, which the run has.
+    """
+    frames = []
+    for row in run.trajectory()[0].rows:
+        frame = seen(run.load_submap(row.submap_index), row.frame_index, row.T_map_cam, rasterizer).frame
+        color = frame.color + COLOR_OFFSET * torch.where(frame.color < 0.5, 1.0, -1.0)
+        color[-3:] = 0.0
+        frames.append(replace(frame, color=color))
     T_other_world = se3.exp(torch.tensor([1.0, 2.0, 3.0, 0.3, -0.2, 0.9], dtype=torch.float64))
-    return Recorded(frames, {i: T_other_world @ at(0.1 * i) for i in range(8) if i != 3})
+    return Recorded(tuple(frames), {i: T_other_world @ at(0.1 * i) for i in range(8) if i != 3})
 
 
 def expected_ate_cm() -> float:
@@ -152,18 +164,93 @@ def test_figures_of_a_run(run: RunDirectory, sequence: Recorded, rasterizer: Ras
     assert value["psnr"] > 50.0  # all that parts them is rounding to 8 bits
     assert value["ssim"] > 0.999
     assert value["depth_l1"] == pytest.approx(100 * OFFSET, abs=0.02)
+    assert value["psnr_withheld"] == value["psnr_withheld_mapped"] == pytest.approx(20.0, abs=1e-4)
+    assert 0.3 < value["ssim_withheld"] < 0.99
+    assert value["depth_l1_withheld"] == pytest.approx(100 * OFFSET, abs=0.02)
+    assert value["coverage_withheld"] == 100.0
     assert value["depth_coverage"] == pytest.approx(100.0)
     assert (value["frames"], value["frames_lost"], value["submaps"]) == (8, 1, 2)
     assert value["gaussians"] == 2 * len(wall(0, at(0.0)))
     assert (value["ms_per_frame"], value["peak_rss_mb"]) == (250.0, 512.5)
     assert report.missing == {}
     assert unit == {
-        "ate_rmse": "cm", "psnr": "dB", "ssim": "", "depth_l1": "cm", "depth_coverage": "%", "frames": "",
+        "ate_rmse": "cm", "psnr_withheld": "dB", "ssim_withheld": "", "depth_l1_withheld": "cm",
+        "psnr_withheld_mapped": "dB", "coverage_withheld": "%", "psnr": "dB", "ssim": "",
+        "depth_l1": "cm", "depth_coverage": "%", "frames": "",
         "frames_lost": "", "submaps": "", "gaussians": "", "ms_per_frame": "ms", "peak_rss_mb": "MB",
     }  # fmt: skip
+    assert list(unit)[:7] == ["ate_rmse", *(name for name in unit if "withheld" in name), "psnr"]
     assert report.evaluated["poses"] == "estimated"
     assert "training views" in report.evaluated["views"]
+    assert report.evaluated["withheld"].startswith("3 of 3 frames")
+    assert report.evaluated["withheld"].endswith("spread evenly")
     assert report.evaluated["trajectory"].startswith("7 of 8 frames")
+
+
+def test_withheld_are_frames_neither_mapped_nor_lost(
+    run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer
+) -> None:
+    told: list[tuple[int, int]] = []
+    evaluate(run, sequence, rasterizer, progress=lambda done, total: told.append((done, total)))
+    assert sequence.asked == [1, 3, 5]
+    assert told == [(frame + 1, 8) for frame in (0, 1, 2, 3, 4, 5, 6)]
+    report = evaluate(run, replace(sequence, asked=[]), rasterizer, withheld_every=3)
+    assert report.evaluated["withheld"].startswith("1 of 3 frames")
+
+    trajectory, atlas = run.trajectory()
+    run.write_trajectory(Trajectory(tuple(replace(row, mapped=row.frame_index != 3) for row in trajectory.rows)), atlas)
+    sequence.asked.clear()
+    evaluate(run, sequence, rasterizer)
+    assert sequence.asked == [3]
+    run.write_trajectory(Trajectory(tuple(replace(row, mapped=True) for row in trajectory.rows)), atlas)
+    assert "was mapped or lost" in evaluate(run, sequence, rasterizer).missing["psnr_withheld"]
+
+
+def test_older_runs_withhold_all_but_keyframes(run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer) -> None:
+    trajectory, atlas = run.trajectory()
+    run.write_trajectory(Trajectory(tuple(replace(row, mapped=False) for row in trajectory.rows)), atlas)
+    submap = run.load_submap(1)
+    run.write_submap(replace(submap, keyframes=submap.keyframes[:1]))
+    report = evaluate(run, sequence, rasterizer)
+    assert sequence.asked == [1, 3, 5, 6]
+    assert "former keyframes that the submap dropped" in report.evaluated["withheld"]
+
+
+def test_withheld_frames_of_an_unsaved_submap_do_not_count(
+    run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer
+) -> None:
+    (run.path / "submaps" / "0001.npz").unlink()
+    assert evaluate(run, sequence, rasterizer).metrics["psnr_withheld"].value == pytest.approx(20.0, abs=1e-4)
+    assert sequence.asked == [1, 3]
+
+
+def test_holes_are_told_apart_from_errors(run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer) -> None:
+    for index in range(2):
+        submap = run.load_submap(index)
+        run.write_submap(submap.kept(submap.gaussians.means[:, 0] < 0.0))
+    value = {name: metric.value for name, metric in evaluate(run, sequence, rasterizer).metrics.items()}
+    assert 20.0 < value["coverage_withheld"] < 60.0
+    assert value["psnr_withheld"] < 10.0
+    assert 15.0 < value["psnr_withheld_mapped"] < 20.5
+
+
+def test_spread_is_even_and_out_of_step_with_mapping() -> None:
+    rows = tuple(TrackedPose(i, i / 30, 0, at(0.0)) for i in range(480))
+    chosen = [row.frame_index for row in spread(rows, 120)]
+    assert chosen == sorted(set(chosen))
+    assert 100 < len(chosen) <= 120
+    assert max(np.diff([0, *chosen, 480])) <= 8
+    phases = np.bincount(np.array(chosen) % 4)  # a fixed step of four would see one of them only
+    assert phases.min() > 20
+    assert spread(rows, 480) == rows == spread(rows, 9999)
+    assert len(spread(rows, 1)) == 1
+    assert spread((), 5) == ()
+
+
+def test_dropped_frames_are_told(run: RunDirectory, rasterizer: Rasterizer) -> None:
+    assert "frames_dropped" not in evaluate(run, None, rasterizer).metrics
+    run.write_summary(run.summary() | {"frames_dropped": 3})
+    assert evaluate(run, None, rasterizer).metrics["frames_dropped"] == Metric(3)
 
 
 def test_unmapped_pixels_count_in_full(run: RunDirectory, rasterizer: Rasterizer) -> None:
@@ -181,7 +268,11 @@ def test_killed_run_without_data_is_still_scored(run: RunDirectory, rasterizer: 
     report = evaluate(run, None, rasterizer, stride=2)
     assert report.metrics["submaps"].value == 1
     assert report.metrics["psnr"].value > 50.0
-    assert report.missing.keys() == {"ate_rmse", "ms_per_frame", "peak_rss_mb"}
+    withheld = {name for name in report.missing if "withheld" in name}
+    assert report.missing.keys() == {"ate_rmse", "ms_per_frame", "peak_rss_mb"} | withheld
+    assert len(withheld) == 5
+    assert report.missing["psnr_withheld"] == "the sequence is not at hand"
+    assert report.evaluated["withheld"].startswith("0 of 2 frames")
     assert report.missing["ate_rmse"] == "no ground truth"
     assert "was killed" in report.missing["ms_per_frame"]
     assert "one keyframe in 2" in report.evaluated["views"]
@@ -193,7 +284,7 @@ def test_run_that_sealed_nothing(tmp_path: Path, rasterizer: Rasterizer) -> None
     with pytest.raises(EvaluationError, match="has no sealed submap yet"):
         evaluate(run, None, rasterizer)
     with pytest.raises(EvaluationError, match="has no sealed submap yet"):
-        figures.contact_sheet_of(run, rasterizer)
+        figures.contact_sheet_of(run, None, rasterizer)
     with pytest.raises(EvaluationError, match="has no trajectory yet"):
         figures.trajectory_plot_of(run, None)
 
@@ -222,9 +313,13 @@ def test_report_on_disk_and_on_a_terminal(tmp_path: Path) -> None:
 
 
 def test_pictures_of_a_run(run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer) -> None:
-    sheet = figures.contact_sheet_of(run, rasterizer, columns=3, width=800)
+    sheet = figures.contact_sheet_of(run, None, rasterizer, columns=3, width=800)
     assert sheet.shape[1] == 800
-    assert figures.contact_sheet_of(run, rasterizer, columns=9, width=800).shape[0] < sheet.shape[0]  # four keyframes
+    assert figures.contact_sheet_of(run, None, rasterizer, columns=9, width=800).shape[0] < sheet.shape[0]  # keyframes
+    withheld = figures.contact_sheet_of(run, sequence, rasterizer, columns=3, width=800)
+    assert sequence.asked == [1, 3, 5]
+    assert withheld.shape == sheet.shape
+    assert not np.array_equal(withheld[40:60], sheet[40:60])
     assert figures.trajectory_plot_of(run, sequence).shape[1] == 1200
     assert figures.trajectory_plot_of(run, None).shape[1] == 1200
 

@@ -165,7 +165,10 @@ def test_run_directory_comes_back(tmp_path: Path, generator: torch.Generator) ->
     for submap in submaps:
         run.write_submap(submap)
     atlas = Atlas(tuple(submap.T_world_map for submap in submaps))
-    rows = tuple(TrackedPose(2 * i, 1e9 + i / 30, i // 2, random_pose(generator), lost=i == 3) for i in range(6))
+    rows = tuple(
+        TrackedPose(2 * i, 1e9 + i / 30, i // 2, random_pose(generator), lost=i == 3, mapped=i in (0, 4))
+        for i in range(6)
+    )
     run.write_trajectory(Trajectory(rows), atlas)
     run.write_summary({"frames": 6, "seconds": 0.5})
 
@@ -175,8 +178,8 @@ def test_run_directory_comes_back(tmp_path: Path, generator: torch.Generator) ->
     for i, submap in enumerate(submaps):
         assert_same_submap(again.load_submap(i), submap)
     read, read_atlas = again.trajectory()
-    assert [(r.frame_index, r.timestamp, r.submap_index, r.lost) for r in read.rows] == [
-        (r.frame_index, r.timestamp, r.submap_index, r.lost) for r in rows
+    assert [(r.frame_index, r.timestamp, r.submap_index, r.lost, r.mapped) for r in read.rows] == [
+        (r.frame_index, r.timestamp, r.submap_index, r.lost, r.mapped) for r in rows
     ]
     for one, two in zip(read.world(read_atlas), Trajectory(rows).world(atlas), strict=True):
         assert torch.equal(one, two)
@@ -185,6 +188,18 @@ def test_run_directory_comes_back(tmp_path: Path, generator: torch.Generator) ->
     assert stamps == pytest.approx([row.timestamp for row in rows], abs=1e-6)
     for one, two in zip(poses, Trajectory(rows).world(atlas), strict=True):
         torch.testing.assert_close(one, two, rtol=0, atol=1e-12)
+
+
+def test_trajectory_of_an_older_run_names_no_mapped_frame(tmp_path: Path, generator: torch.Generator) -> None:
+    run = RunDirectory.create(tmp_path / "a", config_toml="", sequence="")
+    rows = (TrackedPose(0, 0.0, 0, random_pose(generator), mapped=True), TrackedPose(1, 0.1, 0, random_pose(generator)))
+    run.write_trajectory(Trajectory(rows), Atlas((random_pose(generator),)))
+    columns = archive.read_arrays(run.path / "trajectory.npz", "trajectory")
+    del columns["mapped"], columns["kind"], columns["version"]
+    archive.write_arrays(run.path / "trajectory.npz", "trajectory", columns)
+    read, _ = run.trajectory()
+    assert [row.mapped for row in read.rows] == [False, False]
+    assert torch.equal(read.rows[1].T_map_cam, rows[1].T_map_cam)
 
 
 def test_closure_moves_submaps_through_the_trajectory_alone(tmp_path: Path, generator: torch.Generator) -> None:

@@ -79,7 +79,8 @@ def make_way(out: Path, *, overwrite: bool) -> None:
 
 
 def _told(run: RunDirectory, report: Report, cost: str) -> str:
-    metrics = "\n".join(f"  {name:<14}  {metric}" for name, metric in report.metrics.items())
+    width = max(map(len, report.metrics))
+    metrics = "\n".join(f"  {name:<{width}}  {metric}" for name, metric in report.metrics.items())
     files = {
         "contact_sheet.png": "what the camera saw, the map's picture, depth and confidence",
         "trajectory.png": "the estimated path beside the true one",
@@ -89,6 +90,6 @@ def _told(run: RunDirectory, report: Report, cost: str) -> str:
     paths = "\n".join(f"  {run.path / name}  {what}" for name, what in files.items())
     return (
         f"A synthetic apartment without sensor noise: {cost}.\n{metrics}\n"
-        "The pictures that psnr, ssim and depth_l1 are from are those that the map was made of.\n"
+        "Withheld are pictures that the map was not made of; psnr, ssim and depth_l1 alone are of those that it was.\n"
         f"{paths}\n"
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import tyro
 
+from tcgsplat.cli.progress import counting
 from tcgsplat.cli.recorder import Part
 from tcgsplat.cli.usage import UsageError
 from tcgsplat.datasets import Sequence
@@ -35,12 +36,16 @@ class Args:
     """A file of `timestamp tx ty tz qx qy qz qw`, camera to world; its report is report_NAME.json."""
     stride: int = 1
     """Draw every so many-th keyframe."""
+    withheld_every: int | None = None
+    """Draw one in so many of the frames that were never mapped; if not given, 120 of them at most."""
     backend: str = "auto"
     """Rasterizer: auto, numba or reference."""
 
 
 def command(args: Args) -> int:
     """Print the report, and put it and the pictures into the run directory."""
+    if args.stride < 1 or (args.withheld_every is not None and args.withheld_every < 1):
+        raise UsageError("--stride and --withheld-every count from 1")
     run = RunDirectory.open(args.run) if args.run else None
     sequence = _sequence(run, args.sequence)
     if args.trajectory is not None:
@@ -54,16 +59,23 @@ def command(args: Args) -> int:
     if run is None:
         raise UsageError("give a run directory, or --trajectory and --sequence")
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
-    report = scored(run, sequence, rasterizer, args.stride)
+    report = scored(run, sequence, rasterizer, args.stride, args.withheld_every)
     sys.stdout.write(f"{report.table()}\n\nreport.json, contact_sheet.png and trajectory.png are in {run.path}\n")
     return 0
 
 
-def scored(run: RunDirectory, sequence: Sequence | None, rasterizer: Rasterizer, stride: int = 1) -> Report:
+def scored(
+    run: RunDirectory,
+    sequence: Sequence | None,
+    rasterizer: Rasterizer,
+    stride: int = 1,
+    withheld_every: int | None = None,
+) -> Report:
     """The report of a run; it and the pictures are in the run directory."""
-    report = evaluate(run, sequence, rasterizer, stride=stride)
+    with counting("frame") as progress:
+        report = evaluate(run, sequence, rasterizer, stride=stride, withheld_every=withheld_every, progress=progress)
     report.write(run.path / "report.json")
-    canvas.write_png(run.path / "contact_sheet.png", contact_sheet_of(run, rasterizer))
+    canvas.write_png(run.path / "contact_sheet.png", contact_sheet_of(run, sequence, rasterizer))
     canvas.write_png(run.path / "trajectory.png", trajectory_plot_of(run, sequence))
     return report
 
@@ -77,7 +89,8 @@ def _sequence(run: RunDirectory | None, given: Path | None) -> Sequence | None:
         return None
     if not Path(run.sequence).is_dir():
         logger.warning(
-            "%s, the data of the run, is not there: no comparison with the truth; give --sequence", run.sequence
+            "%s, the data of the run, is not there: nothing to compare with but keyframes; give --sequence",
+            run.sequence,
         )
         return None
     return part.open(run.sequence)

@@ -3,7 +3,7 @@
 Every picture is an array of RGB bytes; `canvas.write_png` puts one on disk.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -20,9 +20,11 @@ from tcgsplat.datasets.sequence import Sequence as RgbdSequence
 from tcgsplat.errors import EvaluationError
 from tcgsplat.evaluation import ate, canvas
 from tcgsplat.evaluation.canvas import Picture
+from tcgsplat.evaluation.views import PosedFrame, training_views, withheld_rows, withheld_views
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import render_view
-from tcgsplat.scene.submap import Keyframe, Submap
+from tcgsplat.scene.submap import Submap
+from tcgsplat.scene.trajectory import TrackedPose
 from tcgsplat.storage.run_directory import RunDirectory
 from tcgsplat.tensors import Image, Plane
 
@@ -85,26 +87,33 @@ def contact_sheet(views: Sequence[View], *, width: int = 1600) -> Picture:
     return canvas.drawn(figure)
 
 
-def contact_sheet_of(run: RunDirectory, rasterizer: Rasterizer, *, columns: int = 6, width: int = 1600) -> Picture:
-    """The contact sheet of a run: keyframes at even times, each drawn from its own submap as saved.
+def contact_sheet_of(
+    run: RunDirectory, sequence: RgbdSequence | None, rasterizer: Rasterizer, *, columns: int = 6, width: int = 1600
+) -> Picture:
+    """The contact sheet of a run: views at even times, each drawn from its own submap as saved.
+
+    Frames withheld from the map are shown if the sequence is at hand and there are any, else keyframes, which the map
+    was optimised on; the titles say which.
 
     Raises:
         ArchiveError: if a file of the run is damaged.
+        DatasetError: if a withheld frame cannot be read.
         EvaluationError: if the run has no sealed submap.
     """
     trajectory, _ = run.trajectory()
     saved = run.submap_count
-    rows = [row for row in trajectory.rows if row.submap_index < saved]
+    rows = tuple(row for row in trajectory.rows if row.submap_index < saved)
     if not rows:
         raise EvaluationError(f"{run.path} has no sealed submap yet; let the run go on for longer, or run again")
-    chosen = [rows[i] for i in np.linspace(0, len(rows) - 1, columns).round().astype(int).tolist()]
-    views: dict[int, View] = {}
-    for submap_index, group in groupby(chosen, key=lambda row: row.submap_index):
-        submap = run.load_submap(submap_index)
-        for row in group:
-            keyframe = min(submap.keyframes, key=lambda k: abs(k.frame.index - row.frame_index))
-            views[keyframe.frame.index] = _view(submap, keyframe, rasterizer, start=rows[0].timestamp)
-    return contact_sheet(list(views.values()), width=width)
+    withheld = withheld_rows(run, trajectory) if sequence is not None else ()
+    shown = withheld or rows
+    places = np.unique(np.linspace(0, len(shown) - 1, columns).round().astype(int)).tolist()
+    views: list[View] = []
+    for submap_index, group in groupby((shown[i] for i in places), key=lambda row: row.submap_index):
+        submap, chosen = run.load_submap(submap_index), list(group)
+        frames = withheld_views(chosen, sequence) if withheld and sequence is not None else _nearest(submap, chosen)
+        views += [_view(submap, frame, rasterizer, start=rows[0].timestamp) for frame in frames]
+    return contact_sheet(views, width=width)
 
 
 def trajectory_plot(
@@ -278,10 +287,18 @@ def _style(panel: Axes) -> None:
     panel.spines[["left", "bottom"]].set_color("0.6")
 
 
-def _view(submap: Submap, keyframe: Keyframe, rasterizer: Rasterizer, start: float) -> View:
-    frame = keyframe.frame
-    rendering = render_view(submap, frame.camera, keyframe.T_map_cam, rasterizer)
-    title = f"{frame.timestamp - start:.1f} s, submap {submap.index}"
+def _nearest(submap: Submap, rows: Iterable[TrackedPose]) -> Iterator[PosedFrame]:
+    """The keyframe next to each row in time, once."""
+    indices = np.array([keyframe.frame.index for keyframe in submap.keyframes])
+    for place in sorted({int(np.abs(indices - row.frame_index).argmin()) for row in rows}):
+        yield from training_views(submap, slice(place, place + 1))
+
+
+def _view(submap: Submap, posed: PosedFrame, rasterizer: Rasterizer, start: float) -> View:
+    frame = posed.frame
+    rendering = render_view(submap, frame.camera, posed.T_map_cam, rasterizer)
+    kind = "withheld" if posed.withheld else "keyframe"
+    title = f"{frame.timestamp - start:.1f} s, submap {submap.index}, {kind}"
     return View(title, frame.color, rendering.color, rendering.depth, rendering.confidence)
 
 

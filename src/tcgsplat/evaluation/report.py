@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,15 +12,38 @@ from jaxtyping import Float
 from tcgsplat.datasets.association import MAX_GAP, nearest
 from tcgsplat.datasets.sequence import Sequence
 from tcgsplat.errors import EvaluationError
-from tcgsplat.evaluation import ate, images
+from tcgsplat.evaluation import ate
+from tcgsplat.evaluation.views import (
+    MOST_WITHHELD,
+    ViewScore,
+    in_turn,
+    spread,
+    training_views,
+    withheld_rows,
+    withheld_views,
+)
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.render.view import Rendering, render_view
+from tcgsplat.render.view import MIN_COVERAGE, render_view
 from tcgsplat.scene.atlas import Atlas
-from tcgsplat.scene.frame import Frame
-from tcgsplat.scene.trajectory import Trajectory, parse_tum
+from tcgsplat.scene.trajectory import TrackedPose, Trajectory, parse_tum
 from tcgsplat.storage import atomic
 from tcgsplat.storage.run_directory import RunDirectory
 from tcgsplat.tensors import Pose
+
+_WITHHELD = (
+    ("psnr_withheld", "psnr", "dB"),
+    ("ssim_withheld", "ssim", ""),
+    ("depth_l1_withheld", "depth_l1", "cm"),
+    ("psnr_withheld_mapped", "psnr_mapped", "dB"),
+    ("coverage_withheld", "coverage", "%"),
+)
+_TRAINING = (
+    ("psnr", "psnr", "dB"),
+    ("ssim", "ssim", ""),
+    ("depth_l1", "depth_l1", "cm"),
+    ("depth_coverage", "depth_coverage", "%"),
+)
+"""Metric, the figure of `ViewScore` that it is the mean of, and its unit."""
 
 Times = Float[np.ndarray, " n"]
 """Time stamps, seconds."""
@@ -70,26 +93,44 @@ class Report:
         atomic.write_text(path, self.to_json())
 
 
-def evaluate(run: RunDirectory, sequence: Sequence | None, rasterizer: Rasterizer, *, stride: int = 1) -> Report:
-    """Score a run, finished or not, by its own files and the ground truth of its sequence.
+def evaluate(
+    run: RunDirectory,
+    sequence: Sequence | None,
+    rasterizer: Rasterizer,
+    *,
+    stride: int = 1,
+    withheld_every: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Report:
+    """Score a run, finished or not, by its own files and the frames and ground truth of its sequence.
+
+    Every view is drawn from the submap that it was tracked in, as saved, at its estimated pose, and compared with the
+    camera's image over its valid pixels, so that the border that undistortion leaves empty is not counted. Figures are
+    means over the views.
 
     - `ate_rmse`, cm: camera centres of all tracked frames that have a true pose, after rigid alignment.
-    - `psnr` (dB), `ssim`, `depth_l1` (cm), `depth_coverage` (%): each keyframe drawn from its own submap as saved, at
-      its estimated pose, against its own image; means over the views. The map was optimised on these views.
-    - `frames`, `frames_lost`, `submaps`, `gaussians`, and from the run's summary `ms_per_frame` and `peak_rss_mb`.
+    - `psnr_withheld` (dB), `ssim_withheld`, `depth_l1_withheld` (cm): frames of the sequence that were tracked and
+      never mapped.
+    - `psnr_withheld_mapped` (dB), `coverage_withheld` (%): the PSNR of those of their valid pixels that the map covers
+      by more than half, and the share of these: the rest is what holes cost.
+    - `psnr` (dB), `ssim`, `depth_l1` (cm), `depth_coverage` (%): the keyframes, which the map was optimised on.
+    - `frames`, `frames_lost`, `submaps`, `gaussians`, and from the run's summary `ms_per_frame` and `peak_rss_mb`, and
+      of a run in real time `frames_dropped`.
 
     Args:
         run: The run's directory.
-        sequence: The data, read for ground truth only; None if it is not at hand.
+        sequence: The data; None if it is not at hand.
         rasterizer: Backend to draw with.
         stride: Draw every so many-th keyframe.
+        withheld_every: Draw one withheld frame in so many; `MOST_WITHHELD` of them at most if not given.
+        progress: Told how many frames of how many are done.
 
     Returns:
         The report; a metric that cannot be had is absent, with the reason in `missing`.
 
     Raises:
         ArchiveError: if a file of the run is damaged.
-        DatasetError: if the ground truth is there but cannot be read.
+        DatasetError: if the ground truth is there but cannot be read, or a withheld frame cannot.
         EvaluationError: if the run has no sealed submap.
     """
     trajectory, atlas = run.trajectory()
@@ -97,9 +138,17 @@ def evaluate(run: RunDirectory, sequence: Sequence | None, rasterizer: Rasterize
         raise EvaluationError(f"{run.path} has no sealed submap yet; let the run go on for longer, or run again")
     truth = sequence.ground_truth() if sequence is not None else {}
     scored = sum(row.frame_index in truth for row in trajectory.rows)
+    withheld = withheld_rows(run, trajectory)
+    drawn = spread(withheld, math.ceil(len(withheld) / withheld_every) if withheld_every else MOST_WITHHELD)
+    last = trajectory.rows[-1].frame_index
+
+    def drawn_frame(frame_index: int) -> None:
+        if progress is not None:
+            progress(frame_index + 1, last + 1)
+
     rows = {
         "ate_rmse": _accuracy(trajectory, atlas, truth),
-        **_quality(run, rasterizer, stride),
+        **_quality(run, sequence, rasterizer, stride, drawn, drawn_frame),
         "frames": Metric(len(trajectory)),
         "frames_lost": Metric(sum(row.lost for row in trajectory.rows)),
         **_cost(run.summary()),
@@ -110,10 +159,13 @@ def evaluate(run: RunDirectory, sequence: Sequence | None, rasterizer: Rasterize
             "run": str(run.path),
             "sequence": sequence.name if sequence is not None else run.sequence,
             "trajectory": f"{scored} of {len(trajectory)} frames have a true pose; rigid alignment without scale",
-            "views": f"{'all keyframes' if stride == 1 else f'one keyframe in {stride}'} of the saved submaps, each "
-            "drawn from its own submap: training views",
+            "withheld": _told_withheld(trajectory, len(withheld), len(drawn) if sequence is not None else 0),
+            "views": f"{'all keyframes' if stride == 1 else f'one keyframe in {stride}'} of the saved submaps: "
+            "training views; these and the withheld ones are each drawn from their own submap",
             "poses": "estimated",
-            "pixels": "psnr and ssim: valid pixels; depth_l1: those with a sensor reading, unmapped ones in full",
+            "pixels": "psnr and ssim: valid pixels, without the border that undistortion leaves empty; "
+            f"psnr_withheld_mapped: those with alpha above {MIN_COVERAGE:g}; "
+            "depth_l1: those with a sensor reading, unmapped ones in full",
         },
         missing={name: row for name, row in rows.items() if isinstance(row, str)},
     )
@@ -179,6 +231,12 @@ def associate(times: Times, others: Float[np.ndarray, " m"], *, max_gap: float =
     return [(best[j], j) for j in sorted(best)]
 
 
+def _told_withheld(trajectory: Trajectory, withheld: int, drawn: int) -> str:
+    told = f"{drawn} of {withheld} frames that were tracked in a saved submap and never mapped, spread evenly"
+    known = any(row.mapped for row in trajectory.rows)
+    return told if known else f"{told}; an older run: former keyframes that the submap dropped are taken for withheld"
+
+
 # Each of these gives a metric or, in words, why there is none.
 
 
@@ -191,45 +249,54 @@ def _accuracy(trajectory: Trajectory, atlas: Atlas, truth: Mapping[int, Pose]) -
     return Metric(100.0 * rmse, "cm")
 
 
-def _quality(run: RunDirectory, rasterizer: Rasterizer, stride: int) -> dict[str, Metric | str]:
-    """Submaps are read one after the other, so that memory holds one of them."""
-    scores: list[dict[str, Metric]] = []
+def _quality(
+    run: RunDirectory,
+    sequence: Sequence | None,
+    rasterizer: Rasterizer,
+    stride: int,
+    withheld: tuple[TrackedPose, ...],
+    drawn: Callable[[int], None],
+) -> dict[str, Metric | str]:
+    """Submaps are read one after the other, so that memory holds one of them; `drawn` hears of every frame index."""
+    scores: dict[bool, list[ViewScore]] = {True: [], False: []}
     gaussians = seen = 0
     for index in range(run.submap_count):
         submap = run.load_submap(index)
+        rows = [row for row in withheld if row.submap_index == index]
+        training = training_views(submap, slice(-seen % stride, None, stride))
+        for view in in_turn(training, withheld_views(rows, sequence) if sequence is not None else iter(())):
+            rendering = render_view(submap, view.frame.camera, view.T_map_cam, rasterizer)
+            scores[view.withheld].append(ViewScore.of(rendering, view.frame))
+            drawn(view.frame.index)
         gaussians += len(submap)
-        for keyframe in submap.keyframes:
-            if seen % stride == 0:
-                frame = keyframe.frame
-                scores.append(_score(render_view(submap, frame.camera, keyframe.T_map_cam, rasterizer), frame))
-            seen += 1
-    names = ("psnr", "ssim", "depth_l1", "depth_coverage")
-    means = {name: _mean([score[name] for score in scores]) for name in names}
-    return {**means, "submaps": Metric(run.submap_count), "gaussians": Metric(gaussians)}
-
-
-def _score(rendering: Rendering, frame: Frame) -> dict[str, Metric]:
-    color, depth = rendering.color.clamp(0.0, 1.0), rendering.depth
-    read = frame.valid & (frame.depth > 0)
+        seen += len(submap.keyframes)
+    none_left = "every frame of the saved submaps was mapped or lost"
     return {
-        "psnr": Metric(images.psnr(color, frame.color, frame.valid), "dB"),
-        "ssim": Metric(images.ssim(color, frame.color, frame.valid)),
-        "depth_l1": Metric(100.0 * images.depth_l1(depth, frame.depth, read), "cm"),
-        "depth_coverage": Metric(100.0 * float((depth[read] > 0).to(depth.dtype).mean()), "%"),
+        **_means(scores[True], _WITHHELD, "the sequence is not at hand" if sequence is None else none_left),
+        **_means(scores[False], _TRAINING, "the saved submaps have no keyframe"),
+        "submaps": Metric(run.submap_count),
+        "gaussians": Metric(gaussians),
     }
 
 
-def _mean(views: list[Metric]) -> Metric | str:
-    finite = [view.value for view in views if math.isfinite(view.value)]
-    return Metric(sum(finite) / len(finite), views[0].unit) if finite else "no view has a pixel that counts"
+def _means(scores: list[ViewScore], metrics: tuple[tuple[str, str, str], ...], no_view: str) -> dict[str, Metric | str]:
+    rows: dict[str, Metric | str] = {}
+    for name, figure, unit in metrics:
+        values = [float(getattr(score, figure)) for score in scores]
+        finite = [value for value in values if math.isfinite(value)]
+        nothing = "no view has a pixel that counts" if scores else no_view
+        rows[name] = Metric(sum(finite) / len(finite), unit) if finite else nothing
+    return rows
 
 
 def _cost(summary: Mapping[str, object]) -> dict[str, Metric | str]:
-    ms_per_frame, peak = (summary.get(name) for name in ("ms_per_frame", "peak_rss_mb"))
+    ms_per_frame, peak, dropped = (summary.get(name) for name in ("ms_per_frame", "peak_rss_mb", "frames_dropped"))
     absent = "summary.json does not tell" if summary else "no summary.json: the run has not ended, or was killed"
     rows: dict[str, Metric | str] = {"ms_per_frame": absent, "peak_rss_mb": absent}
     if isinstance(ms_per_frame, int | float):
         rows["ms_per_frame"] = Metric(ms_per_frame, "ms")
     if isinstance(peak, int | float):
         rows["peak_rss_mb"] = Metric(peak, "MB")
+    if isinstance(dropped, int):  # only a run in real time drops any
+        rows = {"frames_dropped": Metric(dropped), **rows}
     return rows

@@ -1,0 +1,110 @@
+"""The views of a run that its map is judged by: those that it was made of, and those that it has never seen."""
+
+import heapq
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from tcgsplat.datasets.sequence import Sequence
+from tcgsplat.evaluation import images
+from tcgsplat.render.view import MIN_COVERAGE, Rendering
+from tcgsplat.scene.frame import Frame
+from tcgsplat.scene.submap import Submap
+from tcgsplat.scene.trajectory import TrackedPose, Trajectory
+from tcgsplat.storage.run_directory import RunDirectory
+from tcgsplat.tensors import Pose
+
+MOST_WITHHELD = 120
+"""Withheld views that are drawn unless told otherwise: their mean PSNR, which varies by some 3 dB from view to view, is
+then known to about 0.3 dB, and an evaluation takes seconds."""
+
+
+@dataclass(frozen=True)
+class PosedFrame:
+    """What the camera saw, and from where in a submap, as estimated, it saw it."""
+
+    frame: Frame
+    T_map_cam: Pose
+    withheld: bool
+    """The map was never optimised on this frame."""
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """How near a rendering is to what the camera saw; NaN where no pixel counts."""
+
+    psnr: float
+    """dB, over the valid pixels."""
+    ssim: float
+    """Over the windows of valid pixels."""
+    depth_l1: float
+    """Centimetres, over the valid pixels with a sensor reading; where nothing is mapped, the reading in full."""
+    depth_coverage: float
+    """Percent of these that have a rendered depth."""
+    psnr_mapped: float
+    """dB, over the valid pixels that the map covers by more than `MIN_COVERAGE`."""
+    coverage: float
+    """Percent of the valid pixels that are covered so."""
+
+    @staticmethod
+    def of(rendering: Rendering, frame: Frame) -> "ViewScore":
+        """The score of a rendering from where `frame` was taken."""
+        color, depth = rendering.color.clamp(0.0, 1.0), rendering.depth
+        mapped, read = rendering.alpha > MIN_COVERAGE, frame.valid & (frame.depth > 0)
+        return ViewScore(
+            psnr=images.psnr(color, frame.color, frame.valid),
+            ssim=images.ssim(color, frame.color, frame.valid),
+            depth_l1=100.0 * images.depth_l1(depth, frame.depth, read),
+            depth_coverage=100.0 * float((depth[read] > 0).to(depth.dtype).mean()),
+            psnr_mapped=images.psnr(color, frame.color, frame.valid & mapped),
+            coverage=100.0 * float(mapped[frame.valid].to(depth.dtype).mean()),
+        )
+
+
+def withheld_rows(run: RunDirectory, trajectory: Trajectory) -> tuple[TrackedPose, ...]:
+    """Frames that were tracked but never mapped, in submaps that are saved; lost ones do not count.
+
+    A run of an older tcgsplat does not tell which frames it mapped. There all frames count that are not keyframes of a
+    saved submap, those among them that were keyframes once.
+
+    Raises:
+        ArchiveError: if a file of the run is damaged.
+    """
+    mapped = {row.frame_index for row in trajectory.rows if row.mapped}
+    if not mapped:
+        for index in range(run.submap_count):
+            mapped |= {keyframe.frame.index for keyframe in run.load_submap(index).keyframes}
+    saved = [row for row in trajectory.rows if row.submap_index < run.submap_count]
+    return tuple(row for row in saved if not row.lost and row.frame_index not in mapped)
+
+
+def spread(rows: tuple[TrackedPose, ...], number: int) -> tuple[TrackedPose, ...]:
+    """About so many of the rows (never more), evenly over all of them: one from each of as many equal stretches.
+
+    Its place within the stretch goes round by the golden ratio. A fixed step could fall in with the rhythm of mapping,
+    and then meet only frames that come right after a mapped one.
+    """
+    stretches = np.arange(min(number, len(rows)))
+    places = (stretches + stretches * ((math.sqrt(5.0) - 1.0) / 2.0) % 1.0) * (len(rows) / max(len(stretches), 1))
+    return tuple(rows[place] for place in np.unique(places.astype(int)).tolist())
+
+
+def training_views(submap: Submap, places: slice) -> Iterator[PosedFrame]:
+    """Keyframes of a submap, those at some places of their order."""
+    return (PosedFrame(keyframe.frame, keyframe.T_map_cam, withheld=False) for keyframe in submap.keyframes[places])
+
+
+def withheld_views(rows: Iterable[TrackedPose], sequence: Sequence) -> Iterator[PosedFrame]:
+    """Withheld frames, each decoded when its turn comes.
+
+    Raises:
+        DatasetError: if one cannot be read.
+    """
+    return (PosedFrame(sequence.frame(row.frame_index), row.T_map_cam, withheld=True) for row in rows)
+
+
+def in_turn(*views: Iterator[PosedFrame]) -> Iterator[PosedFrame]:
+    """Views of several kinds, each in the order of time, merged into one such order."""
+    return heapq.merge(*views, key=lambda view: view.frame.index)
