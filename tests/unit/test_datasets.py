@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from tcgsplat.datasets import open_sequence
+from tcgsplat.datasets.association import MAX_GAP
 from tcgsplat.errors import DatasetError
 
 W, H = 32, 24
@@ -144,6 +145,7 @@ def test_frames_are_read(tmp_path: Path, layout: str) -> None:
     for i, frame in enumerate(sequence):
         assert frame.index == i
         assert frame.timestamp == pytest.approx(FIRST_TIME[layout] + i / RATE[layout], abs=1e-6)
+        assert frame.depth_delay == pytest.approx(0.005 if layout == "tum" else 0.0, abs=1e-6)
         assert frame.camera == sequence.camera
         assert (frame.color.dtype, frame.depth.dtype, frame.valid.dtype) == (torch.float32, torch.float32, torch.bool)
         assert frame.color.shape == (H, W, 3)
@@ -523,6 +525,7 @@ def test_tum_association_takes_the_nearest_and_says_what_it_drops(
         sequence = open_sequence(root)
     assert [round(frame.timestamp, 3) for frame in sequence] == [100.0, 100.067, 100.1]
     assert sequence.frame(0).depth[0, 0] == pytest.approx(1.0)
+    assert sequence.frame(0).depth_timestamp == 100.005
     assert "1 of 4 colour images" in caplog.text
     torch.testing.assert_close(sequence.ground_truth()[1], T_world_cam(2))
 
@@ -681,3 +684,4 @@ def test_real_tum_sequences(name: str, listed: int, with_pose: int) -> None:
     assert 0.3 < float(frame.depth[frame.depth > 0].median()) < 6
     assert 0.05 < float(frame.color[frame.valid].mean()) < 0.95
     assert float(frame.valid.float().mean()) > (0.9 if "fr1" in name else 0.999)
+    assert 0 < abs(frame.depth_delay) <= MAX_GAP

@@ -32,6 +32,8 @@ class ImagePair:
     """Seconds, of the colour image."""
     number: int
     """Place in the layout's own numbering, by which it finds the pose."""
+    depth_timestamp: float | None = None
+    """Seconds, of the depth image; None where the layout gives a pair one time."""
 
 
 def read_text(path: Path) -> str:

@@ -62,7 +62,9 @@ def read_depth(path: Path, scale: float) -> NDArray[np.float32]:
             f"{path} is no depth image: it has {channels} channel{'s' * (channels > 1)} of {raw.dtype}; "
             "depth is one channel of 16-bit integers (PNG) or floating-point numbers (TIFF)"
         )
-    depth = raw.astype(np.float32) / np.float32(scale)
+    depth = np.divide(raw, np.float32(scale), dtype=np.float32)
+    if raw.dtype == np.uint16:  # every number is a reading or 0
+        return depth
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
@@ -97,10 +99,10 @@ def _is_whole(data: bytes) -> bool:
 
 def _png_is_whole(data: bytes) -> bool:
     """Walk the chunks (length, name, content, checksum) to the end chunk."""
-    at = 8
+    at, whole = 8, memoryview(data)
     while at + 12 <= len(data):
         end = at + 12 + int.from_bytes(data[at : at + 4], "big")
-        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+        if zlib.crc32(whole[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
             return False
         if data[at + 4 : at + 8] == b"IEND":
             return True

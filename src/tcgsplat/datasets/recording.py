@@ -60,6 +60,19 @@ class Recording:
         distortion = self.calibration.distortion
         return Rectification.of(self.calibration.camera, distortion) if distortion else None
 
+    @cached_property
+    def _inside(self) -> tuple[slice, slice]:
+        """Rows and columns that the crop leaves."""
+        camera, border = self.calibration.camera, self.calibration.crop
+        return slice(border, camera.height - border), slice(border, camera.width - border)
+
+    @cached_property
+    def _valid(self) -> NDArray[np.bool_]:
+        """Pixels that saw the world, after the crop; the same in every frame, which share it."""
+        camera, rectification = self.calibration.camera, self.rectification
+        valid = rectification.valid if rectification else np.ones((camera.height, camera.width), np.bool_)
+        return valid[self._inside].copy()
+
     def __len__(self) -> int:
         return len(self.pairs)
 
@@ -88,17 +101,15 @@ class Recording:
         if not 0 <= index < len(self):
             raise DatasetError(f"{self.root} has no frame {index}; it has {len(self)}, counted from 0")
         pair = self.pairs[index]
-        color, depth, valid = self._rectified(*self._read(pair))
-        border = self.calibration.crop
-        rows = slice(border, color.shape[0] - border)
-        columns = slice(border, color.shape[1] - border)
+        color, depth = self._rectified(*self._read(pair))
         return Frame(
             index=index,
             timestamp=pair.timestamp,
-            color=torch.from_numpy(color[rows, columns].astype(np.float32) / np.float32(255)),
-            depth=torch.from_numpy(depth[rows, columns].copy()),
-            valid=torch.from_numpy(valid[rows, columns].copy()),
+            color=torch.from_numpy(np.divide(color[self._inside], np.float32(255), dtype=np.float32)),
+            depth=torch.from_numpy(depth[self._inside] * self._valid),
+            valid=torch.from_numpy(self._valid),
             camera=self.camera,
+            depth_timestamp=pair.depth_timestamp,
         )
 
     def ground_truth(self) -> dict[int, Pose]:
@@ -177,13 +188,13 @@ class Recording:
 
     def _rectified(
         self, color: NDArray[np.uint8], depth: NDArray[np.float32]
-    ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         rectification = self.rectification
         if rectification is None:
-            return color, depth, np.ones(depth.shape, np.bool_)
+            return color, depth
         # Registered depth was sampled on the distorted grid of the colour camera, so it moves with the colour.
         depth = rectification.depth(depth) if self.calibration.depth_distorted else depth
-        return rectification.color(color), depth * rectification.valid, rectification.valid
+        return rectification.color(color), depth
 
 
 def _size(image: NDArray[np.generic]) -> str:

@@ -56,7 +56,7 @@ def open_recording(root: Path) -> Recording:
             "apart; the time stamps of rgb.txt and depth.txt must come from one clock"
         )
     pairs = tuple(
-        ImagePair(color=root / name, depth=root / depths[k][1], timestamp=stamp, number=i)
+        ImagePair(root / name, root / depths[k][1], timestamp=stamp, number=i, depth_timestamp=depths[k][0])
         for i, ((stamp, name), k, g) in enumerate(zip(colors, index, gap, strict=True))
         if g <= MAX_GAP
     )
