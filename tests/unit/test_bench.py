@@ -1,9 +1,11 @@
 """`tcgsplat bench`: what is timed, what is counted, and the physical limit that follows."""
 
+import importlib.util
 import json
 import math
 from dataclasses import asdict
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -167,6 +169,15 @@ def test_the_first_frame_does_not_count_and_a_skipped_stage_takes_no_time():
     assert track.Timed({}, rows[:1], lost=0).milliseconds()["track"].median == pytest.approx(9000.0)
 
 
+def test_updates_beside_have_a_line_of_their_own():
+    timed = track.Timed({}, [{"track": 0.010}], lost=0, updates=[9.0, 0.010, 0.030])
+    assert track.table(timed).splitlines()[1:] == [
+        "track             10.00    10.00    10.00",
+        "update            20.00    20.00    29.00   beside the frames, 2 of them",
+    ]
+    assert len(track.table(track.Timed({}, [{"track": 0.010}], lost=0)).splitlines()) == 2
+
+
 def test_ate_is_of_the_frames_whose_pose_is_known():
     moved = se3.exp(torch.tensor([1.0, 2.0, 3.0, 0.4, 0.5, 0.6], dtype=torch.float64))
     truth = {i: se3.exp(torch.tensor([0.1 * i, 0.01 * i**2, 0, 0, 0, 0], dtype=torch.float64)) for i in range(6)}
@@ -208,6 +219,7 @@ def test_a_recorded_sequence_is_timed(flat: Path, tmp_path: Path, capsys: pytest
     assert sum(ms.values()) - ms["frame"] == pytest.approx(ms["frame"], rel=0.05)
     assert 0.0 < written["ate_rmse_cm"] < 1.0
     assert 0.0 < written["finish_ms"] < 1e5
+    assert written["updates"] == 0 or written["update_milliseconds"]["median"] > 0.0
     said = capsys.readouterr().out
     assert "flat, 80x60, 6 frames; " in said and "mapper.iterations = 2, seed 4\n" in said
     assert f"{ms['track']:.2f}" in said and f"ATE {written['ate_rmse_cm']:.3f} cm" in said
@@ -217,3 +229,50 @@ def test_without_truth_there_is_no_error_of_it(flat: Path, capsys: pytest.Captur
     (flat / "groundtruth.txt").unlink()
     assert main(["bench", "track", str(flat), "--limit", "3", "--mapper.iterations", "1"]) == 0
     assert "ATE unknown: fewer than 3 true poses" in capsys.readouterr().out
+
+
+# Scripts of benchmarks/.
+
+
+def script(name: str) -> ModuleType:
+    """One of the scripts as a module."""
+    path = Path(__file__).parents[2] / "benchmarks" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_open3d_is_asked_for_where_it_is_missing(flat: Path, capsys: pytest.CaptureFixture[str]):
+    if importlib.util.find_spec("open3d"):
+        pytest.skip("open3d is here")
+    open3d_slam = script("open3d_slam")
+    assert open3d_slam.main(open3d_slam.Args(flat)) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("open3d_slam: open3d is not installed for this Python; run `python -m pip install ")
+    assert said.count("\n") == 1
+
+
+def test_both_systems_are_counted_alike():
+    open3d_slam = script("open3d_slam")
+    rows = [{"load": 9.0, "frame": 18.0}, {"load": 0.010, "frame": 0.030}, {"load": 0.020, "frame": 0.080}]
+    truth = {i: se3.exp(torch.tensor([0.1 * i, 0.01 * i**2, 0, 0, 0, 0], dtype=torch.float64)) for i in range(3)}
+    figures = open3d_slam.figures(track.Timed(truth, rows, lost=1, finish=0.006), truth)
+    assert figures["ate_rmse_cm"] == pytest.approx(0.0, abs=1e-9)
+    assert figures["ms_mean"] == pytest.approx((20 + 60 + 6) / 2)
+    assert figures["ms_median"] == pytest.approx(40.0)
+    assert figures["ms_mean_with_reading"] == pytest.approx((30 + 80 + 6) / 2)
+    row = open3d_slam.table({"us": figures}).splitlines()[-1].split()
+    assert row == ["us", "0.00", "43.0", "40.0", "58.0", "58.0", "1"]
+
+
+def test_the_same_is_run_at_several_sizes(flat: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    full_resolution = script("full_resolution")
+    flat.rename(tmp_path / "80x60")  # a sequence that is there is not made again
+    args = full_resolution.Args(tmp_path, sizes=("80x60",), limit=4, json=tmp_path / "times.json")
+    assert full_resolution.main(args) == 0
+    assert "\n80x60, 4 frames: ATE 0." in capsys.readouterr().out
+    written = json.loads((tmp_path / "times.json").read_text())
+    assert written["80x60"]["milliseconds"]["frame"]["mean"] > 0
+    assert full_resolution.main(full_resolution.Args(tmp_path, sizes=("80",))) == 1
+    assert "full_resolution: --sizes: 80 is not a size; write it like 640x480" in capsys.readouterr().err

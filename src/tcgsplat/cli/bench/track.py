@@ -33,9 +33,9 @@ class Args:
     """Time the whole system on a recorded sequence, at the size that its images have; nothing is written down.
 
     `load` is waiting for the reader, which decodes the next frames beside; the stages are those of the system, by its
-    own names; `frame` is the whole of a frame: load, stages, and what is between them. The first frame is left out:
-    caches are cold, and the whole first view is mapped. Use `taskset -c 0,1 tcgsplat ...` to allow only some cores.
-    Every setting is a flag, as for `tcgsplat run`.
+    own names; `frame` is the whole of a frame: load, stages, and what is between them; `update` is a mapping update on
+    its own thread. The first frame and update are left out: caches are cold, and the whole first view is mapped.
+    Use `taskset -c 0,1 tcgsplat ...` to allow only some cores. Every setting is a flag, as for `tcgsplat run`.
     """
 
     folder: tyro.conf.Positional[Path]
@@ -63,6 +63,10 @@ class Spread:
     median: float
     percentile_95: float
 
+    def __str__(self) -> str:
+        """As the columns of the table."""
+        return f"{self.mean:>9.2f}{self.median:>9.2f}{self.percentile_95:>9.2f}"
+
     @staticmethod
     def of(seconds: Iterable[float]) -> "Spread":
         """Of at least one duration."""
@@ -80,6 +84,8 @@ class Timed:
     """Of every frame, by stage: `load` first, `frame` (all of it) last."""
     lost: int
     """Frames whose pose is a guess."""
+    updates: Sequence[float] = ()
+    """Seconds of each mapping update that ran beside the frames."""
     finish: float = 0.0
     """Seconds after the last frame: for what was still being mapped beside it, and the sealing."""
 
@@ -88,6 +94,10 @@ class Timed:
         rows = self.seconds[1:] or self.seconds
         stages = dict.fromkeys(stage for row in rows for stage in row)
         return {stage: Spread.of(row.get(stage, 0.0) for row in rows) for stage in stages}
+
+    def update_milliseconds(self) -> Spread | None:
+        """Of a mapping update, without the first, if there are others; None if there were none."""
+        return Spread.of(self.updates[1:] or self.updates) if self.updates else None
 
     def ate_cm(self, truth: Mapping[int, Pose]) -> float | None:
         """Root mean square of the error of position after rigid alignment; None where fewer than three are known."""
@@ -104,19 +114,19 @@ def command(args: Args, settings: Mapping[str, str]) -> int:
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     timed = measured(sequence, config, rasterizer)
     error = timed.ate_cm(sequence.ground_truth())
-    camera = sequence.camera
+    camera, update = sequence.camera, timed.update_milliseconds()
     changed = "".join(f", {path} = {value}" for path, value in settings.items())
     sys.stdout.write(
         f"{sequence.name}, {camera.width}x{camera.height}, {len(timed.T_world_cam)} frames; {machine()}, a thread on "
-        f"each; {rasterizer.name}, preset {args.preset}{changed}, seed {config.seed}\n{table(timed.milliseconds())}\n"
-        f"ATE {'unknown: fewer than 3 true poses' if error is None else f'{error:.3f} cm, rigid'}; {timed.lost} lost; "
-        f"{1000 * timed.finish:.0f} ms to finish after the last frame\n"
+        f"each; {rasterizer.name}, preset {args.preset}{changed}, seed {config.seed}\n{table(timed)}\n"
+        f"ATE {accuracy(error)}; {timed.lost} lost; {1000 * timed.finish:.0f} ms to finish after the last frame\n"
     )
     if args.json is not None:
         written = {
             "sequence": sequence.name, "width": camera.width, "height": camera.height,
             "frames": len(timed.T_world_cam), "frames_lost": timed.lost, "ate_rmse_cm": error,
             "milliseconds": {stage: asdict(spread) for stage, spread in timed.milliseconds().items()},
+            "updates": len(timed.updates), "update_milliseconds": asdict(update) if update else None,
             "finish_ms": 1000 * timed.finish, "machine": machine(), "threads": available_cores(),
             "versions": versions(), "backend": rasterizer.name, "preset": args.preset, "seed": config.seed,
             "config": to_toml(config),
@@ -131,6 +141,7 @@ def measured(sequence: datasets.Sequence, config: SlamConfig, rasterizer: Raster
     compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some ten seconds"))
     slam, lost = Slam(config, rasterizer), 0
     seconds: list[Mapping[str, float]] = []
+    updates: list[float] = []
     with RunProgress(len(sequence)) as progress:
         for frame, waited in waiting(sequence):
             started = time.perf_counter()
@@ -138,13 +149,14 @@ def measured(sequence: datasets.Sequence, config: SlamConfig, rasterizer: Raster
             stepped = time.perf_counter() - started
             seconds.append({"load": waited, **report.seconds, "frame": waited + stepped})
             lost += not report.tracked.converged
+            updates += [report.update.seconds] if report.update else []
             progress.observe(report)
     started = time.perf_counter()
     slam.finish()
     finish = time.perf_counter() - started
     world = slam.trajectory.world(slam.atlas)
     poses = {row.frame_index: T for row, T in zip(slam.trajectory.rows, world, strict=True)}
-    return Timed(poses, seconds, lost, finish)
+    return Timed(poses, seconds, lost, updates, finish)
 
 
 def waiting(frames: Iterable[Frame]) -> Iterator[tuple[Frame, float]]:
@@ -158,8 +170,15 @@ def waiting(frames: Iterable[Frame]) -> Iterator[tuple[Frame, float]]:
         yield frame, time.perf_counter() - started
 
 
-def table(milliseconds: Mapping[str, Spread]) -> str:
-    """A line a stage."""
-    head = f"{'milliseconds':<14}{'mean':>9}{'median':>9}{'95 %':>9}"
-    rows = (f"{stage:<14}{s.mean:>9.2f}{s.median:>9.2f}{s.percentile_95:>9.2f}" for stage, s in milliseconds.items())
-    return "\n".join((head, *rows))
+def table(timed: Timed) -> str:
+    """A line a stage, and one of the mapping updates that ran beside."""
+    rows = [f"{stage:<14}{spread}" for stage, spread in timed.milliseconds().items()]
+    update = timed.update_milliseconds()
+    if update:
+        rows.append(f"{'update':<14}{update}   beside the frames, {len(timed.updates[1:]) or 1} of them")
+    return "\n".join([f"{'milliseconds':<14}{'mean':>9}{'median':>9}{'95 %':>9}", *rows])
+
+
+def accuracy(ate_cm: float | None) -> str:
+    """For a line of text."""
+    return "unknown: fewer than 3 true poses" if ate_cm is None else f"{ate_cm:.3f} cm, rigid"
