@@ -10,6 +10,7 @@ from test_cli import report
 from tcgsplat.cli import summary
 from tcgsplat.cli.progress import RunProgress
 from tcgsplat.datasets.playback import Arrival
+from tcgsplat.slam import MapUpdate
 
 
 def test_dropped_frames_are_in_the_progress_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
@@ -47,6 +48,14 @@ def test_an_ordinary_summary_has_no_delay():
     told = tally.summary(submaps=1, gaussians=30, seconds=0.25, interrupted=False).to_dict()
     expected = {"realtime": False, "frames_dropped": 0, "frames_total": 1, "ms_late_median": None, "ms_late_p95": None}
     assert expected.items() <= told.items()
+
+
+def test_mapping_updates_are_timed_apart_from_the_frames():
+    tally = summary.Tally()
+    for index, ms in enumerate([None, 30.0, None, 50.0]):
+        update = None if ms is None else MapUpdate(index, 1, 1, 0.1, ms / 1000)
+        tally.count(replace(report(index), update=update), 0.02)
+    assert tally.summary(submaps=1, gaussians=30, seconds=0.25, interrupted=False).ms_update == pytest.approx(40.0)
 
 
 def test_a_camera_that_gave_nothing_has_a_summary_too():

@@ -29,7 +29,7 @@ from tcgsplat.storage.run_directory import RunDirectory
 
 logger = logging.getLogger(__name__)
 
-MAX_HELD = 0.01
+MAX_HELD = 0.05
 """Share of a real-time run in which reading may have stopped the camera's clock without a word about it."""
 
 

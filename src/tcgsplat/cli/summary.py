@@ -34,6 +34,8 @@ class Summary:
     """Of the same."""
     stage_ms: dict[str, float]
     """Mean over all frames of each stage of `Slam.step`, by its name."""
+    ms_update: float
+    """Mean over the mapping updates, which are made on a thread of their own; the first one included."""
     interrupted: bool
     """Stopped by Ctrl-C; what had been seen by then is sealed and saved."""
     peak_rss_mb: float | None
@@ -93,6 +95,8 @@ class Tally:
     """Milliseconds that each frame took."""
     stage_ms: dict[str, list[float]] = field(default_factory=dict)
     """Of these, by the stages of `Slam.step`."""
+    update_ms: list[float] = field(default_factory=list)
+    """Milliseconds that each mapping update took."""
 
     def count(self, report: StepReport, seconds: float) -> None:
         """Add a report, and the wall time that its frame took."""
@@ -101,6 +105,8 @@ class Tally:
         self.ms.append(1000.0 * seconds)
         for stage, duration in report.seconds.items():
             self.stage_ms.setdefault(stage, []).append(1000.0 * duration)
+        if report.update is not None:
+            self.update_ms.append(1000.0 * report.update.seconds)
 
     def follow(self, arrival: Arrival, stepped: float) -> None:
         """Add how a frame came, and the reading of the clock at the end of its step."""
@@ -120,6 +126,7 @@ class Tally:
             ms_per_frame=statistics.fmean(_warm(self.ms)),
             ms_per_frame_median=statistics.median(_warm(self.ms)),
             stage_ms={stage: statistics.fmean(_warm(times)) for stage, times in self.stage_ms.items()},
+            ms_update=statistics.fmean(self.update_ms or [0.0]),
             interrupted=interrupted,
             frames_dropped=self.dropped,
             frames_total=self.frames + self.dropped,
