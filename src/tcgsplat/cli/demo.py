@@ -2,20 +2,12 @@
 
 import shutil
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tcgsplat.cli.eval import scored
-from tcgsplat.cli.export import world_map
-from tcgsplat.cli.progress import counting, say
-from tcgsplat.cli.recorder import Part, begin, recorded
-from tcgsplat.cli.settings import Flags, resolved
-from tcgsplat.datasets.synthetic import SynthConfig, synthesize
+from tcgsplat.cli.flags import Flags
 from tcgsplat.errors import ArchiveError
-from tcgsplat.evaluation.report import Report
-from tcgsplat.render.backends import open_rasterizer
-from tcgsplat.storage.ply import write_gaussians
-from tcgsplat.storage.run_directory import RunDirectory
 
 
 @dataclass(frozen=True)
@@ -41,6 +33,15 @@ class Args:
 
 def command(args: Args) -> int:
     """All of it, ending with a few lines on how it went and where everything is."""
+    from tcgsplat.cli.progress import counting, say
+    from tcgsplat.cli.recorder import Part, begin, recorded
+    from tcgsplat.cli.scoring import scored
+    from tcgsplat.cli.settings import resolved
+    from tcgsplat.cli.world_map import world_map
+    from tcgsplat.datasets.synthetic import SynthConfig, synthesize
+    from tcgsplat.render.backends import open_rasterizer
+    from tcgsplat.storage.ply import write_gaussians
+
     config = resolved(args.preset, None, args.settings, None)
     rasterizer = open_rasterizer()
     make_way(args.out, overwrite=args.overwrite)
@@ -56,7 +57,8 @@ def command(args: Args) -> int:
         return 130
     report = scored(run, sequence, rasterizer)
     write_gaussians(run.path / "map.ply", *world_map(run))
-    sys.stdout.write(_told(run, report, f"{summary}; kernels compiled in {summary.seconds_compiling:.1f} s before"))
+    cost = f"{summary}; kernels compiled in {summary.seconds_compiling:.1f} s before"
+    sys.stdout.write(_told(run.path, report.metrics, cost))
     return 0
 
 
@@ -66,6 +68,8 @@ def make_way(out: Path, *, overwrite: bool) -> None:
     Raises:
         ArchiveError: if there is something that is not a demo, or that may not be replaced.
     """
+    from tcgsplat.storage.run_directory import RunDirectory
+
     inside = {path.name for path in out.iterdir()} if out.is_dir() else {out.name} if out.exists() else set()
     if not inside:
         return
@@ -78,16 +82,16 @@ def make_way(out: Path, *, overwrite: bool) -> None:
     shutil.rmtree(out / "sequence")
 
 
-def _told(run: RunDirectory, report: Report, cost: str) -> str:
-    width = max(map(len, report.metrics))
-    metrics = "\n".join(f"  {name:<{width}}  {metric}" for name, metric in report.metrics.items())
+def _told(folder: Path, values: Mapping[str, object], cost: str) -> str:
+    width = max(map(len, values))
+    metrics = "\n".join(f"  {name:<{width}}  {value}" for name, value in values.items())
     files = {
         "contact_sheet.png": "what the camera saw, the map's picture, depth and confidence",
         "trajectory.png": "the estimated path beside the true one",
         "map.ply": "the Gaussians, for any viewer of 3D Gaussian splatting",
         "report.json": "the figures above, and what was evaluated",
     }
-    paths = "\n".join(f"  {run.path / name}  {what}" for name, what in files.items())
+    paths = "\n".join(f"  {folder / name}  {what}" for name, what in files.items())
     return (
         f"A synthetic apartment without sensor noise: {cost}.\n{metrics}\n"
         "Withheld are pictures that the map was not made of; psnr, ssim and depth_l1 alone are of those that it was.\n"

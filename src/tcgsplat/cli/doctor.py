@@ -8,10 +8,6 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-import torch
-
-from tcgsplat.cli.summary import machine, versions
-
 
 @dataclass(frozen=True)
 class Args:
@@ -34,6 +30,8 @@ class Finding:
 
 def command(args: Args) -> int:  # noqa: ARG001
     """Print the findings; the exit code is 0 if `tcgsplat run` can work here."""
+    from tcgsplat.cli.summary import machine, versions
+
     packages = ", ".join(f"{name} {number}" for name, number in versions().items())
     findings = (numba_finding(), cuda_finding(), Finding("reference", True, ("plain torch, slow: for checking",)))
     sys.stdout.write(f"{packages}\n{platform.platform()}; {machine()}\n")
@@ -67,6 +65,8 @@ def numba_finding() -> Finding:
 
 def cuda_finding() -> Finding:
     """The GPU backend, which this version does not have."""
+    import torch
+
     built = torch.version.cuda
     if built is None:
         device = f"torch {version('torch')} is built without CUDA; a build with it would see a GPU"

@@ -1,24 +1,12 @@
 """`tcgsplat eval`: how good a run is, in figures and pictures."""
 
-import logging
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
-from tcgsplat.cli.progress import counting
-from tcgsplat.cli.recorder import Part
 from tcgsplat.cli.usage import UsageError
-from tcgsplat.datasets import Sequence
-from tcgsplat.evaluation import canvas
-from tcgsplat.evaluation.figures import contact_sheet_of, trajectory_plot_of
-from tcgsplat.evaluation.report import Report, evaluate, score_trajectory
-from tcgsplat.render.backends import open_rasterizer
-from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.storage.run_directory import RunDirectory
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -44,10 +32,15 @@ class Args:
 
 def command(args: Args) -> int:
     """Print the report, and put it and the pictures into the run directory."""
+    from tcgsplat.cli.scoring import data_of, scored
+    from tcgsplat.evaluation.report import score_trajectory
+    from tcgsplat.render.backends import open_rasterizer
+    from tcgsplat.storage.run_directory import RunDirectory
+
     if args.stride < 1 or (args.withheld_every is not None and args.withheld_every < 1):
         raise UsageError("--stride and --withheld-every count from 1")
     run = RunDirectory.open(args.run) if args.run else None
-    sequence = _sequence(run, args.sequence)
+    sequence = data_of(run, args.sequence)
     if args.trajectory is not None:
         if sequence is None:
             raise UsageError("--trajectory needs something to compare with; give a run, or the data by --sequence")
@@ -62,35 +55,3 @@ def command(args: Args) -> int:
     report = scored(run, sequence, rasterizer, args.stride, args.withheld_every)
     sys.stdout.write(f"{report.table()}\n\nreport.json, contact_sheet.png and trajectory.png are in {run.path}\n")
     return 0
-
-
-def scored(
-    run: RunDirectory,
-    sequence: Sequence | None,
-    rasterizer: Rasterizer,
-    stride: int = 1,
-    withheld_every: int | None = None,
-) -> Report:
-    """The report of a run; it and the pictures are in the run directory."""
-    with counting("frame") as progress:
-        report = evaluate(run, sequence, rasterizer, stride=stride, withheld_every=withheld_every, progress=progress)
-    report.write(run.path / "report.json")
-    canvas.write_png(run.path / "contact_sheet.png", contact_sheet_of(run, sequence, rasterizer))
-    canvas.write_png(run.path / "trajectory.png", trajectory_plot_of(run, sequence))
-    return report
-
-
-def _sequence(run: RunDirectory | None, given: Path | None) -> Sequence | None:
-    """The part of the data that the run used, or None if it is not at hand."""
-    part = Part.of(run) if run else Part()
-    if given is not None:
-        return part.open(given)
-    if run is None:
-        return None
-    if not Path(run.sequence).is_dir():
-        logger.warning(
-            "%s, the data of the run, is not there: nothing to compare with but keyframes; give --sequence",
-            run.sequence,
-        )
-        return None
-    return part.open(run.sequence)

@@ -1,19 +1,10 @@
 """`tcgsplat export`: a run's map and path in the formats that other programs open."""
 
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 import tyro
-
-from tcgsplat.errors import ArchiveError
-from tcgsplat.scene.gaussians import Gaussians
-from tcgsplat.scene.trajectory import format_tum
-from tcgsplat.storage import atomic
-from tcgsplat.storage.ply import write_gaussians
-from tcgsplat.storage.run_directory import RunDirectory
-from tcgsplat.tensors import PerGaussian
 
 
 @dataclass(frozen=True)
@@ -36,6 +27,12 @@ class Args:
 
 def command(args: Args) -> int:
     """Write what was asked for, and say where it is."""
+    from tcgsplat.cli.world_map import world_map
+    from tcgsplat.scene.trajectory import format_tum
+    from tcgsplat.storage import atomic
+    from tcgsplat.storage.ply import write_gaussians
+    from tcgsplat.storage.run_directory import RunDirectory
+
     run = RunDirectory.open(args.run)
     out = args.out or run.path
     out.mkdir(parents=True, exist_ok=True)
@@ -49,20 +46,3 @@ def command(args: Args) -> int:
         atomic.write_text(out / "trajectory.txt", text)
         sys.stdout.write(f"{len(trajectory)} poses: {out / 'trajectory.txt'}\n")
     return 0
-
-
-def world_map(run: RunDirectory) -> tuple[Gaussians, PerGaussian]:
-    """The Gaussians of all sealed submaps in the world frame, and the confidence of each.
-
-    Raises:
-        ArchiveError: if there is no sealed submap, or one is damaged.
-    """
-    parts, confidences = [], []
-    for index in range(run.submap_count):
-        submap = run.load_submap(index)
-        parts.append(submap.gaussians.transformed(submap.T_world_map))
-        confidences.append(submap.confidence.value)
-    if not parts:
-        raise ArchiveError(f"{run.path} has no sealed submap yet; let the run go on for longer, or run again")
-    columns = {f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Gaussians)}
-    return Gaussians(**columns), torch.cat(confidences)

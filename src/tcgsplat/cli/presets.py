@@ -8,9 +8,6 @@ from shutil import get_terminal_size
 
 import tyro
 
-from tcgsplat import presets
-from tcgsplat.config import value_text
-
 
 @dataclass(frozen=True)
 class Args:
@@ -22,6 +19,9 @@ class Args:
 
 def command(args: Args) -> int:
     """Print to standard output."""
+    from tcgsplat import presets
+    from tcgsplat.config import value_text
+
     if not args.name:
         width = max(map(len, presets.PRESETS))
         sys.stdout.writelines(f"{name:<{width}}  {presets.SUMMARIES[name]}\n" for name in presets.PRESETS)

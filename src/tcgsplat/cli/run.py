@@ -6,9 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from tcgsplat.cli.recorder import Part, begin, recorded
-from tcgsplat.cli.settings import Flags, resolved
-from tcgsplat.render.backends import open_rasterizer
+from tcgsplat.cli.flags import Flags
 
 
 @dataclass(frozen=True)
@@ -52,6 +50,10 @@ class Args:
 
 def command(args: Args) -> int:
     """Run, and say in one line what came of it."""
+    from tcgsplat.cli.recorder import Part, begin, recorded
+    from tcgsplat.cli.settings import resolved
+    from tcgsplat.render.backends import open_rasterizer
+
     config = resolved(args.preset, args.config, args.settings, args.seed)
     part = Part(args.start, args.stride, args.limit)
     sequence = part.open(args.folder)

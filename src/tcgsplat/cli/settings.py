@@ -3,17 +3,12 @@
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
+from tcgsplat.cli.flags import Flags as Flags
 from tcgsplat.cli.usage import UsageError
 from tcgsplat.config import SlamConfig, from_toml, with_settings
 from tcgsplat.errors import ConfigError
 from tcgsplat.presets import preset
-
-Flags = Annotated[Mapping[str, str], tyro.conf.Fixed, tyro.conf.Suppress]
-"""Texts of flags such as `--mapper.iterations 20` by dotted path; `main` puts them here, not the parser."""
 
 
 def resolved(name: str, file: Path | None, flags: Mapping[str, str], seed: int | None) -> SlamConfig:
