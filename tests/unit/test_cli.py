@@ -164,7 +164,7 @@ def test_flags_may_be_written_in_all_usual_ways(tmp_path: Path, capsys: pytest.C
 
 def report(index: int, lost: str = "", *, seconds: float = 0.01) -> StepReport:
     tracked = Tracked(se3.identity(), lost)
-    return StepReport(index, tracked, None, None, 0, 1000 + index, {"track": seconds, "map": 2 * seconds})
+    return StepReport(index, tracked, False, None, None, 0, 1000 + index, {"track": seconds, "map": 2 * seconds})
 
 
 def test_losing_the_way_is_told_once_not_for_every_frame(capsys: pytest.CaptureFixture[str]):
