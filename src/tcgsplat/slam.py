@@ -76,6 +76,7 @@ class Slam:
         self._schedule = Schedule(config.schedule)
         self._mapping_thread = ThreadPoolExecutor(1, thread_name_prefix="mapping")
         self._updating: Future[tuple[Submap, MapUpdate]] | None = None
+        self._since_mapped = 0
         self.motion = ConstantVelocity()
         self.submap = self._anchored(se3.identity(), index=0)
         self.atlas = Atlas().with_submap(self.submap.T_world_map)
@@ -84,9 +85,10 @@ class Slam:
     def step(self, frame: Frame) -> StepReport:
         """Track, perhaps switch submap, perhaps map; the first frame's camera is the origin of the world."""
         frame, sealed, clock = frame.to(self._device), None, _Laps()
+        self._since_mapped += 1
 
         # The map that was optimised meanwhile comes into use, after as many frames on a slow machine as on a fast one.
-        update = self._finished_update() if self._schedule.adopts(frame.index, self.submap) else None
+        update = self._finished_update() if self._schedule.adopts(self._since_mapped) else None
         clock.lap("wait")
 
         # Track: the map stands still, only the camera moves (equations 17 to 19).
@@ -107,12 +109,12 @@ class Slam:
             self.motion, T_map_cam = self.motion.rebased(), se3.identity()
 
         # Map: grow where the view is new, and have it all optimised and judged while the next frames are tracked.
-        maps = tracked.converged and self._schedule.maps(frame.index, self.submap)
+        maps = tracked.converged and self._schedule.maps(self._since_mapped, self.submap)
         if maps:
             update = self._finished_update() or update
             clock.lap("wait")
             grown = self._mapper.grown(synchronized(frame, self.motion.velocity), T_map_cam, self.submap)
-            self.submap = grown.submap
+            self.submap, self._since_mapped = grown.submap, 0
             self._updating = self._mapping_thread.submit(self._updated, grown)
             clock.lap("grow")
             if self.config.schedule.map_lag == 0:

@@ -48,7 +48,11 @@ def test_the_first_frame_is_mapped_and_begins_no_second_submap(config: ScheduleC
 
 def test_mapping_comes_round_after_the_last_mapped_frame() -> None:
     schedule = Schedule(MOTION)
-    assert [i for i in range(11, 20) if schedule.maps(i, submap(3, 10))] == [14, 15, 16, 17, 18, 19]
+    assert [i for i in range(1, 7) if schedule.maps(i, submap(3, 10))] == [4, 5, 6]
+
+
+def test_an_update_is_adopted_after_its_lag() -> None:
+    assert [i for i in range(1, 6) if Schedule(replace(MOTION, map_lag=3)).adopts(i)] == [3, 4, 5]
 
 
 @pytest.mark.parametrize(

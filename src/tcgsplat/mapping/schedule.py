@@ -41,7 +41,7 @@ class ScheduleConfig:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Decisions on rhythm, from the submap alone."""
+    """Decisions on rhythm, from the submap and a count of frames."""
 
     config: ScheduleConfig
 
@@ -54,12 +54,13 @@ class Schedule:
         far = se3.translation_norm(T_map_cam) > self.config.submap_distance
         return far or math.degrees(se3.rotation_angle(T_map_cam)) > self.config.submap_angle
 
-    def maps(self, frame_index: int, submap: Submap) -> bool:
-        """Whether this frame is mapped: `map_every` frames after the last one that was, or at once if all is gone."""
-        if not submap.keyframes or len(submap) == 0:
-            return True
-        return frame_index - submap.keyframes[-1].frame.index >= self.config.map_every
+    def maps(self, frames_since: int, submap: Submap) -> bool:
+        """Whether a frame is mapped that comes so many frames after the last one that was; at once if all is gone.
 
-    def adopts(self, frame_index: int, submap: Submap) -> bool:
-        """Whether from this frame on tracking uses what the newest mapping update made."""
-        return bool(submap.keyframes) and frame_index - submap.keyframes[-1].frame.index >= self.config.map_lag
+        Counted are frames that were seen: where a live camera's are dropped, fewer are mapped as well.
+        """
+        return not submap.keyframes or len(submap) == 0 or frames_since >= self.config.map_every
+
+    def adopts(self, frames_since: int) -> bool:
+        """Whether tracking now uses what the mapping update made that began so many frames ago."""
+        return frames_since >= self.config.map_lag
