@@ -96,6 +96,14 @@ def wall(index: int, T_world_map: Pose) -> Submap:
     )
 
 
+def stepped(index: int, T_world_map: Pose) -> Submap:
+    """The wall with its left half a metre nearer."""
+    submap = wall(index, T_world_map)
+    means = submap.gaussians.means.clone()
+    means[means[:, 0] < 0.0, 2] = 1.0
+    return replace(submap, gaussians=replace(submap.gaussians, means=means))
+
+
 def seen(submap: Submap, index: int, T_map_cam: Pose, rasterizer: Rasterizer) -> Keyframe:
     """A keyframe whose image is the map's own picture, and whose depth is `OFFSET` farther, with a hole."""
     rendering = render_view(submap, CAMERA, T_map_cam, rasterizer)
@@ -248,9 +256,31 @@ def test_spread_is_even_and_out_of_step_with_mapping() -> None:
 
 
 def test_dropped_frames_are_told(run: RunDirectory, rasterizer: Rasterizer) -> None:
+    run.write_summary(run.summary() | {"realtime": False, "frames_dropped": 0, "ms_late_median": None})
     assert "frames_dropped" not in evaluate(run, None, rasterizer).metrics
-    run.write_summary(run.summary() | {"frames_dropped": 3})
-    assert evaluate(run, None, rasterizer).metrics["frames_dropped"] == Metric(3)
+    run.write_summary(run.summary() | {"realtime": True, "frames_dropped": 3, "ms_late_median": 21.5})
+    metrics = evaluate(run, None, rasterizer).metrics
+    assert (metrics["frames_dropped"], metrics["ms_late"]) == (Metric(3), Metric(21.5, "ms"))
+
+
+def test_depth_of_another_instant_is_brought_to_that_of_colour(
+    run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer
+) -> None:
+    """The camera moves at 3 m/s along a wall with a step; depth comes late, and shows the step where it is then."""
+    delay, late = 0.03, []
+    submaps = [stepped(0, at(0.0)), stepped(1, at(0.4))]
+    for row, frame in zip(run.trajectory()[0].rows, sequence.frames, strict=True):
+        depth = seen(submaps[row.submap_index], 0, row.T_map_cam @ at(3.0 * delay), rasterizer).frame.depth
+        late.append(replace(frame, depth=depth, depth_timestamp=frame.timestamp + delay))
+    for submap in submaps:
+        run.write_submap(submap)
+    as_if_together = tuple(replace(frame, depth_timestamp=None) for frame in late)
+    compensated, ignored = (
+        evaluate(run, replace(sequence, frames=frames), rasterizer).metrics["depth_l1_withheld"].value - 100 * OFFSET
+        for frames in (tuple(late), as_if_together)
+    )
+    assert abs(compensated) < 2.0
+    assert ignored > 5.0
 
 
 def test_unmapped_pixels_count_in_full(run: RunDirectory, rasterizer: Rasterizer) -> None:

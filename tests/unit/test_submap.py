@@ -112,3 +112,18 @@ def test_moving_a_submap_moves_every_frame_that_was_tracked_in_it() -> None:
     assert all(torch.equal(a, b) for a, b in zip(before[:2], after[:2], strict=True))
     for a, b in zip(before[2:], after[2:], strict=True):
         torch.testing.assert_close(se3.inverse(a) @ b, pose(0, 5))
+
+
+def test_velocity_is_the_cameras_own_and_goes_on_across_submaps() -> None:
+    velocity = torch.tensor([0.3, -0.1, 0.5, 0.2, 0.1, -0.4], dtype=torch.float64)
+    stamps = [0.0, 0.03, 0.1, 0.13]
+    world = [pose(2, 1) @ se3.exp(velocity * stamp) for stamp in stamps]
+    atlas = Atlas().with_submap(pose(1)).with_submap(world[2])
+    rows = [
+        TrackedPose(i, stamp, submap, se3.inverse(atlas.T_world_map[submap]) @ T)
+        for i, (stamp, submap, T) in enumerate(zip(stamps, [0, 0, 1, 1], world, strict=True))
+    ]
+    for found in Trajectory(tuple(rows)).velocities(atlas):
+        torch.testing.assert_close(found, velocity)
+    assert Trajectory(tuple(rows[:1])).velocities(atlas)[0].tolist() == [0.0] * 6
+    assert Trajectory().velocities(atlas) == []

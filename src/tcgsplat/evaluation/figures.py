@@ -20,7 +20,13 @@ from tcgsplat.datasets.sequence import Sequence as RgbdSequence
 from tcgsplat.errors import EvaluationError
 from tcgsplat.evaluation import ate, canvas
 from tcgsplat.evaluation.canvas import Picture
-from tcgsplat.evaluation.views import PosedFrame, training_views, withheld_rows, withheld_views
+from tcgsplat.evaluation.views import (
+    PosedFrame,
+    training_views,
+    velocities_by_frame,
+    withheld_rows,
+    withheld_views,
+)
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import render_view
 from tcgsplat.scene.submap import Submap
@@ -100,19 +106,23 @@ def contact_sheet_of(
         DatasetError: if a withheld frame cannot be read.
         EvaluationError: if the run has no sealed submap.
     """
-    trajectory, _ = run.trajectory()
+    trajectory, atlas = run.trajectory()
     saved = run.submap_count
     rows = tuple(row for row in trajectory.rows if row.submap_index < saved)
     if not rows:
         raise EvaluationError(f"{run.path} has no sealed submap yet; let the run go on for longer, or run again")
     withheld = withheld_rows(run, trajectory) if sequence is not None else ()
     shown = withheld or rows
+    velocities = velocities_by_frame(trajectory, atlas)
     places = np.unique(np.linspace(0, len(shown) - 1, columns).round().astype(int)).tolist()
     views: list[View] = []
     for submap_index, group in groupby((shown[i] for i in places), key=lambda row: row.submap_index):
         submap, chosen = run.load_submap(submap_index), list(group)
-        frames = withheld_views(chosen, sequence) if withheld and sequence is not None else _nearest(submap, chosen)
-        views += [_view(submap, frame, rasterizer, start=rows[0].timestamp) for frame in frames]
+        if withheld and sequence is not None:
+            posed = withheld_views(chosen, velocities, sequence)
+        else:
+            posed = _nearest(submap, chosen)
+        views += [_view(submap, one, rasterizer, start=rows[0].timestamp) for one in posed]
     return contact_sheet(views, width=width)
 
 

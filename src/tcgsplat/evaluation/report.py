@@ -19,6 +19,7 @@ from tcgsplat.evaluation.views import (
     in_turn,
     spread,
     training_views,
+    velocities_by_frame,
     withheld_rows,
     withheld_views,
 )
@@ -114,8 +115,9 @@ def evaluate(
     - `psnr_withheld_mapped` (dB), `coverage_withheld` (%): the PSNR of those of their valid pixels that the map covers
       by more than half, and the share of these: the rest is what holes cost.
     - `psnr` (dB), `ssim`, `depth_l1` (cm), `depth_coverage` (%): the keyframes, which the map was optimised on.
-    - `frames`, `frames_lost`, `submaps`, `gaussians`, and from the run's summary `ms_per_frame` and `peak_rss_mb`, and
-      of a run in real time `frames_dropped`.
+    - `frames`, `frames_lost`, `submaps`, `gaussians`, and from the run's summary `ms_per_frame` and `peak_rss_mb`.
+    - Of a run in real time, from its summary: `frames_dropped`, and `ms_late`, the median from a frame's capture to its
+      pose.
 
     Args:
         run: The run's directory.
@@ -259,12 +261,13 @@ def _quality(
 ) -> dict[str, Metric | str]:
     """Submaps are read one after the other, so that memory holds one of them; `drawn` hears of every frame index."""
     scores: dict[bool, list[ViewScore]] = {True: [], False: []}
+    velocities = velocities_by_frame(*run.trajectory())
     gaussians = seen = 0
     for index in range(run.submap_count):
         submap = run.load_submap(index)
         rows = [row for row in withheld if row.submap_index == index]
-        training = training_views(submap, slice(-seen % stride, None, stride))
-        for view in in_turn(training, withheld_views(rows, sequence) if sequence is not None else iter(())):
+        unseen = withheld_views(rows, velocities, sequence) if sequence is not None else iter(())
+        for view in in_turn(training_views(submap, slice(-seen % stride, None, stride)), unseen):
             rendering = render_view(submap, view.frame.camera, view.T_map_cam, rasterizer)
             scores[view.withheld].append(ViewScore.of(rendering, view.frame))
             drawn(view.frame.index)
@@ -290,13 +293,15 @@ def _means(scores: list[ViewScore], metrics: tuple[tuple[str, str, str], ...], n
 
 
 def _cost(summary: Mapping[str, object]) -> dict[str, Metric | str]:
-    ms_per_frame, peak, dropped = (summary.get(name) for name in ("ms_per_frame", "peak_rss_mb", "frames_dropped"))
+    ms_per_frame, peak = (summary.get(name) for name in ("ms_per_frame", "peak_rss_mb"))
+    dropped, late = (summary.get(name) for name in ("frames_dropped", "ms_late_median"))
     absent = "summary.json does not tell" if summary else "no summary.json: the run has not ended, or was killed"
     rows: dict[str, Metric | str] = {"ms_per_frame": absent, "peak_rss_mb": absent}
     if isinstance(ms_per_frame, int | float):
         rows["ms_per_frame"] = Metric(ms_per_frame, "ms")
     if isinstance(peak, int | float):
         rows["peak_rss_mb"] = Metric(peak, "MB")
-    if isinstance(dropped, int):  # only a run in real time drops any
-        rows = {"frames_dropped": Metric(dropped), **rows}
+    if summary.get("realtime") is True:
+        rows["frames_dropped"] = Metric(dropped) if isinstance(dropped, int) else absent
+        rows["ms_late"] = Metric(late, "ms") if isinstance(late, int | float) else absent
     return rows

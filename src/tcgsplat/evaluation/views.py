@@ -2,19 +2,23 @@
 
 import heapq
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
+from torch import Tensor
 
 from tcgsplat.datasets.sequence import Sequence
 from tcgsplat.evaluation import images
 from tcgsplat.render.view import MIN_COVERAGE, Rendering
+from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory
 from tcgsplat.storage.run_directory import RunDirectory
 from tcgsplat.tensors import Pose
+from tcgsplat.tracking.synchronization import synchronized
 
 MOST_WITHHELD = 120
 """Withheld views that are drawn unless told otherwise: their mean PSNR, which varies by some 3 dB from view to view, is
@@ -96,13 +100,27 @@ def training_views(submap: Submap, places: slice) -> Iterator[PosedFrame]:
     return (PosedFrame(keyframe.frame, keyframe.T_map_cam, withheld=False) for keyframe in submap.keyframes[places])
 
 
-def withheld_views(rows: Iterable[TrackedPose], sequence: Sequence) -> Iterator[PosedFrame]:
-    """Withheld frames, each decoded when its turn comes.
+def withheld_views(
+    rows: Iterable[TrackedPose], velocities: Mapping[int, Float[Tensor, "6"]], sequence: Sequence
+) -> Iterator[PosedFrame]:
+    """Withheld frames, each decoded when its turn comes, with depth brought to the instant of colour as in the run.
+
+    Args:
+        rows: Which frames.
+        velocities: Of `Trajectory.velocities`, by frame index.
+        sequence: What they are read from.
 
     Raises:
         DatasetError: if one cannot be read.
     """
-    return (PosedFrame(sequence.frame(row.frame_index), row.T_map_cam, withheld=True) for row in rows)
+    for row in rows:
+        frame = synchronized(sequence.frame(row.frame_index), velocities[row.frame_index])
+        yield PosedFrame(frame, row.T_map_cam, withheld=True)
+
+
+def velocities_by_frame(trajectory: Trajectory, atlas: Atlas) -> dict[int, Float[Tensor, "6"]]:
+    """Velocity of the camera by frame index, as `Trajectory.velocities` has it."""
+    return dict(zip((row.frame_index for row in trajectory.rows), trajectory.velocities(atlas), strict=True))
 
 
 def in_turn(*views: Iterator[PosedFrame]) -> Iterator[PosedFrame]:

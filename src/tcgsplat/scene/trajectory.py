@@ -4,8 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from tcgsplat.geometry import quaternion
+from tcgsplat.geometry import quaternion, se3
 from tcgsplat.scene.atlas import Atlas
 from tcgsplat.tensors import Pose
 
@@ -42,6 +44,20 @@ class Trajectory:
     def world(self, atlas: Atlas) -> list[Pose]:
         """`T_world_cam` of every row; composed late, so that corrections of the atlas reach every frame."""
         return [atlas.T_world_map[row.submap_index] @ row.T_map_cam for row in self.rows]
+
+    def velocities(self, atlas: Atlas) -> list[Float[Tensor, "6"]]:
+        """Tangent per second (metres, radians) of every row in the camera's own frame: T(t + dt) = T(t) exp(v dt).
+
+        From the row before to the row after, as far as there are these; zero where no time passes between them.
+        """
+        poses, last = self.world(atlas), len(self.rows) - 1
+        found: list[Tensor] = []
+        for i in range(len(poses)):
+            a, b = max(i - 1, 0), min(i + 1, last)
+            elapsed = self.rows[b].timestamp - self.rows[a].timestamp
+            step = se3.log(se3.inverse(poses[a]) @ poses[b])
+            found.append(step / elapsed if elapsed > 0 else torch.zeros_like(step))
+        return found
 
 
 def format_tum(
