@@ -3,6 +3,8 @@
 import importlib.util
 import json
 import math
+import subprocess
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
@@ -67,6 +69,16 @@ def test_about_twenty_five_splats_show_in_a_pixel():
     assert float(area.sum()) / (80 * 60) == pytest.approx(25, abs=3)
     again = render.scene(SMALL)
     assert torch.equal(again.means, splats.means) and torch.equal(again.features, splats.features)
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys; from tcgsplat.cli.main import main; main(['bench', 'track', '--help'])\n"
+        "sys.exit(str({'torch', 'numba', 'numpy', 'cv2'} & set(sys.modules) or ''))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stderr.strip() == ""
+    assert done.stdout.startswith("usage: tcgsplat bench track")
 
 
 # Counts.

@@ -1,16 +1,56 @@
 """`tcgsplat bench`: how long the stages take on this machine."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from tcgsplat.cli.bench.render import Args as Render
-from tcgsplat.cli.bench.render import command as time_rendering
-from tcgsplat.cli.bench.track import Args as Track
-from tcgsplat.cli.bench.track import command as time_tracking
-from tcgsplat.cli.settings import Flags
+from tcgsplat.cli.flags import Flags
 from tcgsplat.cli.usage import UsageError
+
+
+@dataclass(frozen=True)
+class Render:
+    """Time the CPU rasterizer, forward and backward, on random scenes of three sizes.
+
+    Colour, confidence and plane depth take part in the loss; derivatives go to all parameters and to the pose. Times
+    are medians in milliseconds. `autograd` is torch's share, `iteration` the whole. A second table counts what each
+    scene needs and says which share of the time this machine could not do without: the physical limit.
+    """
+
+    json: Path | None = None
+    """File to write to: an object from size to numbers, stages as `forward_ms`, floors as `forward_floor_ms`."""
+    repeats: int = 20
+    """Timed iterations of each size, after three that are not."""
+    threads: int | None = None
+    """Worker threads; as many as there are cores if left out."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """Time the whole system on a recorded sequence, at the size that its images have; nothing is written down.
+
+    `load` is waiting for the reader, which decodes the next frames beside; the stages are those of the system, by its
+    own names; `frame` is the whole of a frame: load, stages, and what is between them; `update` is a mapping update on
+    its own thread. The first frame and update are left out: caches are cold, and the whole first view is mapped.
+    Use `taskset -c 0,1 tcgsplat ...` to allow only some cores. Every setting is a flag, as for `tcgsplat run`.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """The sequence."""
+    limit: int | None = None
+    """Use no more than so many frames."""
+    preset: str = "default"
+    """Where the settings start from: see `tcgsplat presets`."""
+    config: Path | None = None
+    """A TOML file of settings, such as the config.toml of a run."""
+    backend: str = "auto"
+    """Rasterizer: auto, numba or reference."""
+    seed: int | None = None
+    """Of all randomness; that of the preset if left out."""
+    json: Path | None = None
+    """File to write the figures to, with the settings in full."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +69,11 @@ class Args:
 def command(args: Args) -> int:
     """Print tables, and write the file that was asked for."""
     if isinstance(args.what, Track):
-        return time_tracking(args.what, args.settings)
+        from tcgsplat.cli.bench import track
+
+        return track.command(args.what, args.settings)
     if args.settings:
         raise UsageError(f"bench render has no settings, but --{next(iter(args.settings))} was given; leave it out")
-    return time_rendering(args.what)
+    from tcgsplat.cli.bench import render
+
+    return render.command(args.what)

@@ -7,12 +7,12 @@ import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from tcgsplat.cli.bench import Render
 from tcgsplat.cli.bench.limit import Machine, Needs, floors
 from tcgsplat.cli.summary import machine
 from tcgsplat.geometry import se3
@@ -23,23 +23,6 @@ from tcgsplat.render.numba_cpu.passes import Drawn, Passes
 from tcgsplat.render.numba_cpu.workers import available_cores
 from tcgsplat.render.protocol import MAX_OPACITY, Splats
 from tcgsplat.storage import atomic
-
-
-@dataclass(frozen=True)
-class Args:
-    """Time the CPU rasterizer, forward and backward, on random scenes of three sizes.
-
-    Colour, confidence and plane depth take part in the loss; derivatives go to all parameters and to the pose. Times
-    are medians in milliseconds. `autograd` is torch's share, `iteration` the whole. A second table counts what each
-    scene needs and says which share of the time this machine could not do without: the physical limit.
-    """
-
-    json: Path | None = None
-    """File to write to: an object from size to numbers, stages as `forward_ms`, floors as `forward_floor_ms`."""
-    repeats: int = 20
-    """Timed iterations of each size, after three that are not."""
-    threads: int | None = None
-    """Worker threads; as many as there are cores if left out."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +88,7 @@ class Result:
         }
 
 
-def command(args: Args) -> int:
+def command(args: Render) -> int:
     """Print two tables, and write the file that was asked for."""
     able = Machine.measured(args.threads or available_cores())
     results: dict[Size, Result] = {}

@@ -5,13 +5,12 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
-import tyro
 
 from tcgsplat import datasets
+from tcgsplat.cli.bench import Track
 from tcgsplat.cli.kernels import compile_kernels
 from tcgsplat.cli.progress import RunProgress, say
 from tcgsplat.cli.recorder import Part
@@ -26,32 +25,6 @@ from tcgsplat.scene.frame import Frame
 from tcgsplat.slam import Slam
 from tcgsplat.storage import atomic
 from tcgsplat.tensors import Pose
-
-
-@dataclass(frozen=True)
-class Args:
-    """Time the whole system on a recorded sequence, at the size that its images have; nothing is written down.
-
-    `load` is waiting for the reader, which decodes the next frames beside; the stages are those of the system, by its
-    own names; `frame` is the whole of a frame: load, stages, and what is between them; `update` is a mapping update on
-    its own thread. The first frame and update are left out: caches are cold, and the whole first view is mapped.
-    Use `taskset -c 0,1 tcgsplat ...` to allow only some cores. Every setting is a flag, as for `tcgsplat run`.
-    """
-
-    folder: tyro.conf.Positional[Path]
-    """The sequence."""
-    limit: int | None = None
-    """Use no more than so many frames."""
-    preset: str = "default"
-    """Where the settings start from: see `tcgsplat presets`."""
-    config: Path | None = None
-    """A TOML file of settings, such as the config.toml of a run."""
-    backend: str = "auto"
-    """Rasterizer: auto, numba or reference."""
-    seed: int | None = None
-    """Of all randomness; that of the preset if left out."""
-    json: Path | None = None
-    """File to write the figures to, with the settings in full."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +80,7 @@ class Timed:
         return 100.0 * ate.ate_rmse_of_poses([self.T_world_cam[i] for i in common], [truth[i] for i in common])
 
 
-def command(args: Args, settings: Mapping[str, str]) -> int:
+def command(args: Track, settings: Mapping[str, str]) -> int:
     """Print a table, and write the file that was asked for."""
     config = resolved(args.preset, args.config, settings, args.seed)
     sequence = Part(limit=args.limit).open(args.folder)
