@@ -62,7 +62,7 @@ def read_depth(path: Path, scale: float) -> NDArray[np.float32]:
             f"{path} is no depth image: it has {channels} channel{'s' * (channels > 1)} of {raw.dtype}; "
             "depth is one channel of 16-bit integers (PNG) or floating-point numbers (TIFF)"
         )
-    depth = np.divide(raw, np.float32(scale), dtype=np.float32)
+    depth: NDArray[np.float32] = np.divide(raw, np.float32(scale), dtype=np.float32)
     if raw.dtype == np.uint16:  # every number is a reading or 0
         return depth
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))

@@ -42,8 +42,8 @@ def synchronized(frame: Frame, velocity: Float[Tensor, "6"]) -> Frame:
     """
     if frame.depth_delay == 0:
         return frame
-    T_color_depth = se3.exp(velocity.detach().cpu() * frame.depth_delay)
-    length, angle = se3.translation_norm(T_color_depth), se3.rotation_angle(T_color_depth)
+    step = velocity.detach().cpu() * frame.depth_delay
+    length, angle = float(step[:3].norm()), float(step[3:].norm())
     if not (length < MAX_STEP and angle < MAX_STEP):  # neither holds for NaN
         return frame
     inverse_depth = kernels.inverse(np.ascontiguousarray(frame.depth.cpu().numpy()))
@@ -55,7 +55,7 @@ def synchronized(frame: Frame, velocity: Float[Tensor, "6"]) -> Frame:
         return frame
     reach = min(math.ceil(parallax), MAX_REACH)
     nearest = cv2.dilate(inverse_depth, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
-    H, e = _projection(frame.camera, se3.inverse(T_color_depth))
+    H, e = _projection(frame.camera, se3.exp(-step))
     depth = kernels.moved(inverse_depth, nearest, np.ascontiguousarray(frame.valid.cpu().numpy()), H, e)
     return replace(frame, depth=torch.from_numpy(depth).to(frame.depth.device), depth_timestamp=None)
 
