@@ -15,13 +15,13 @@ import torch
 
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
-from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.view import Rendering
 from tcgsplat.scene.frame import Frame
-from tcgsplat.tensors import Plane, Pose
+from tcgsplat.tensors import Image, Plane, Pose
 from tcgsplat.tracking import alignment_kernels as kernels
 
 Floats = npt.NDArray[np.float32]
+Doubles = npt.NDArray[np.float64]
 
 _ENOUGH_FOR_EXPOSURE = 100.0
 """Sum of weights below which gain and offset are left alone: about as many points."""
@@ -29,6 +29,9 @@ _FLAT_VARIANCE = 0.002
 """Variance of intensity, grey levels squared, that a gain of 1 is worth: an image flatter than that keeps it."""
 _STEP_PRIOR = 0.05
 """Spread of a step that is expected before anything is seen, metres and radians."""
+_LOW, _HIGH = np.sort(np.indices((6, 6)), axis=0)
+_HESSIAN_ENTRY = kernels.HESSIAN + 6 * _LOW - _LOW * (_LOW - 1) // 2 + _HIGH - _LOW
+"""Where each entry of the symmetric H is among the sums."""
 
 
 @dataclass(frozen=True)
@@ -72,10 +75,6 @@ class Alignment:
 
     T_map_cam: Pose
     iterations: int
-    color_residual: float
-    """Robust spread of the intensity residual, grey levels of [0, 1]."""
-    depth_residual: float
-    """Robust spread of the point-to-plane residual, in units of the depth noise."""
     overlap: float
     """Share of the rendered view that falls into the live image."""
     agreement: float
@@ -84,52 +83,46 @@ class Alignment:
     """Of live and rendered intensity where the depth does not disagree, in [-1, 1]; does not feel the exposure."""
 
 
+def luma(color: Image) -> Floats:
+    """Intensity of an RGB image [h, w], on the CPU."""
+    return kernels.luma(color.numpy())  # type: ignore[no-any-return]
+
+
 @dataclass(frozen=True)
 class _Level:
-    intensity: Floats
-    depth: Floats
-    camera: Camera
+    """Both views at one resolution."""
+
+    passes: int
+    points: Floats
+    """Of the rendered view, [POINT, n]."""
+    live: Floats
+    """Of the frame, [h, w, CHANNELS]."""
+    intrinsics: Floats
+    """fx, fy, cx, cy, pixels."""
+    gate: float
+    """Metres, times (1 + z/2)."""
 
 
-def luma(color: torch.Tensor) -> Floats:
-    """Intensity of an RGB image [h, w], on the CPU."""
-    weights = torch.tensor([0.299, 0.587, 0.114], dtype=color.dtype)
-    return (color @ weights).numpy()  # type: ignore[no-any-return]
-
-
-def _pyramid(intensity: Floats, depth: Floats, camera: Camera, levels: int) -> list[_Level]:
-    pyramid = [_Level(np.ascontiguousarray(intensity), np.ascontiguousarray(depth), camera)]
-    for _ in range(levels - 1):
-        finer = pyramid[-1]
-        pyramid.append(
-            _Level(
-                kernels.halved_intensity(finer.intensity),
-                kernels.halved_depth(finer.depth),
-                finer.camera.scaled(0.5),
-            )
-        )
-    return pyramid
-
-
-def _intrinsics(camera: Camera) -> tuple[Floats, Floats]:
-    return np.array([camera.fx, camera.fy], np.float32), np.array([camera.cx, camera.cy], np.float32)
-
-
-def _reference(rendering: Rendering, weight: Plane, camera: Camera, config: AlignmentConfig) -> list[Floats]:
-    """Points of each level of the rendered view, finest first."""
-    alpha = rendering.alpha
-    # What is hardly covered saw nothing, so that its black does not bleed into the coarse levels' points.
-    depth = torch.where(alpha > config.min_alpha, rendering.depth, -1.0).numpy()
-    intensity = luma(rendering.color / alpha.clamp_min(1e-3)[..., None])
-    points = []
-    levels = _pyramid(intensity, depth, camera, len(config.iterations))
+def _levels(frame: Frame, rendering: Rendering, weight: Plane, config: AlignmentConfig) -> list[_Level]:
+    """The levels that have passes, finest first."""
+    intensity, depth = kernels.rendered_view(
+        rendering.color.numpy(), rendering.composited_plane_depth.numpy(), rendering.alpha.numpy(),
+        np.float32(config.min_alpha),
+    )  # fmt: skip
     weights = np.ascontiguousarray(weight.numpy())
-    for number, level in enumerate(levels):
-        stride, radius = (config.stride, 2) if number == 0 else (1, 1)
-        focal, center = _intrinsics(level.camera)
-        points.append(kernels.reference_points(level.intensity, level.depth, weights, focal, center, radius, stride))
-        weights = kernels.halved_intensity(weights)
-    return points
+    live, live_depth = kernels.live_view(frame.color.numpy(), frame.depth.numpy(), frame.valid.numpy())
+    camera, levels = frame.camera, []
+    for number, passes in enumerate(config.iterations):
+        if number:
+            intensity, weights, live = (kernels.halved_intensity(image) for image in (intensity, weights, live))
+            depth, live_depth = kernels.halved_depth(depth), kernels.halved_depth(live_depth)
+            camera = camera.scaled(0.5)
+        if passes:
+            intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+            stride, radius, gate = (1, 1, 2 * config.gate) if number else (config.stride, 2, config.gate)
+            points = kernels.reference_points(intensity, depth, weights, intrinsics, radius, stride)
+            levels.append(_Level(passes, points, kernels.live_image(live, live_depth), intrinsics, gate))
+    return levels
 
 
 @dataclass
@@ -141,17 +134,17 @@ class _Photometry:
     color_scale: float = 0.05
     depth_scale: float = 2.0
 
-    def refit(self, stats: npt.NDArray[np.float64]) -> None:
+    def refit(self, sums: Doubles) -> None:
         """Exposure from weighted moments (a prior of small variance keeps flat images at gain 1), spreads from rms."""
-        if stats[kernels.COLOR_WEIGHT] > 0:
-            self.color_scale = max(0.008, float(stats[kernels.COLOR_SQUARES] / stats[kernels.COLOR_WEIGHT]) ** 0.5)
-        if stats[kernels.DEPTH_WEIGHT] > 0:
-            self.depth_scale = max(0.3, float(stats[kernels.DEPTH_SQUARES] / stats[kernels.DEPTH_WEIGHT]) ** 0.5)
-        total = float(stats[kernels.GAIN_W])
+        if sums[kernels.COLOR_WEIGHT] > 0:
+            self.color_scale = max(0.008, float(sums[kernels.COLOR_SQUARES] / sums[kernels.COLOR_WEIGHT]) ** 0.5)
+        if sums[kernels.DEPTH_WEIGHT] > 0:
+            self.depth_scale = max(0.3, float(sums[kernels.DEPTH_SQUARES] / sums[kernels.DEPTH_WEIGHT]) ** 0.5)
+        total = float(sums[kernels.GAIN_W])
         if total > _ENOUGH_FOR_EXPOSURE:
-            reference, live = float(stats[kernels.GAIN_R]) / total, float(stats[kernels.GAIN_L]) / total
-            variance = float(stats[kernels.GAIN_RR]) / total - reference**2
-            covariance = float(stats[kernels.GAIN_RL]) / total - reference * live
+            reference, live = float(sums[kernels.GAIN_R]) / total, float(sums[kernels.GAIN_L]) / total
+            variance = float(sums[kernels.GAIN_RR]) / total - reference**2
+            covariance = float(sums[kernels.GAIN_RL]) / total - reference * live
             self.gain = min(1.5, max(0.67, (covariance + _FLAT_VARIANCE) / (variance + _FLAT_VARIANCE)))
             self.offset = live - self.gain * reference
 
@@ -167,15 +160,39 @@ def correlation(weight: float, x: float, y: float, xx: float, xy: float, yy: flo
     return (xy / total - mean_x * mean_y + prior) / math.sqrt(variance_x * variance_y)
 
 
-def _step(H: npt.NDArray[np.float64], g: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _constants(level: _Level, T: Doubles, photometry: _Photometry, config: AlignmentConfig) -> Floats:
+    """Of one pass, in the kernel's order."""
+    constants = np.empty(kernels.CONSTANTS, np.float32)
+    constants[kernels.ROTATION : kernels.TRANSLATION] = T[:3, :3].ravel()
+    constants[kernels.TRANSLATION : kernels.INTRINSICS] = T[:3, 3]
+    constants[kernels.INTRINSICS : kernels.GAIN] = level.intrinsics
+    constants[kernels.GAIN : kernels.COLOR_SCALE] = photometry.gain, photometry.offset
+    constants[kernels.COLOR_SCALE : kernels.GATE] = photometry.color_scale, photometry.depth_scale
+    constants[kernels.GATE : kernels.SIGMA_FLOOR] = level.gate, config.depth_weight
+    constants[kernels.SIGMA_FLOOR :] = config.sigma_floor, config.sigma_slope
+    return constants
+
+
+def _step(sums: Doubles) -> Doubles:
     """The Gauss-Newton step, damped as if a step of 0 +- 5 cm and +- 0.05 radians had been measured.
 
     Beside thousands of residuals that is nothing, but what they leave open (a flat wall, a coarse level) stays put.
     """
-    full = np.zeros((6, 6))
-    full[np.triu_indices(6)] = H
-    full += np.triu(full, 1).T
-    return -np.asarray(np.linalg.solve(full + np.eye(6) / _STEP_PRIOR**2, g), np.float64)
+    H, g = sums[_HESSIAN_ENTRY] + np.eye(6) / _STEP_PRIOR**2, sums[kernels.GRADIENT : kernels.GRADIENT + 6]
+    return -np.asarray(np.linalg.solve(H, g), np.float64)
+
+
+def _exp(tangent: Doubles) -> Doubles:
+    """`se3.exp` in numpy, which takes a sixth of torch's time for matrices of this size."""
+    rho, (x, y, z) = tangent[:3], tangent[3:]
+    angle = math.hypot(x, y, z)
+    length = max(angle, 1e-300)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) / length
+    sine, versine = np.sin(angle), 2 * np.sin(0.5 * angle) ** 2
+    T = np.eye(4)
+    T[:3, :3] += sine * K + versine * (K @ K)
+    T[:3, 3] = rho + K @ (versine / length * rho + (1 - sine / length) * (K @ rho))
+    return T
 
 
 def align(frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, config: AlignmentConfig) -> Alignment:
@@ -188,42 +205,28 @@ def align(frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, co
         T_map_ref: Pose of the rendered view, and the guess to start from.
         config: Constants.
     """
-    points = _reference(rendering, weight, frame.camera, config)
-    depth = torch.where(frame.valid, frame.depth, -1.0).numpy()
-    live = _pyramid(luma(frame.color), depth, frame.camera, len(config.iterations))
-
+    levels = _levels(frame, rendering, weight, config)
+    finest = levels[0]
     T = np.eye(4)  # reference camera to live camera
-    photometry, stats, passes = _Photometry(), np.zeros(kernels.STATISTICS), 0
-    for number in reversed(range(len(live))):
-        level = live[number]
-        focal, center = _intrinsics(level.camera)
+    photometry, sums, passes = _Photometry(), np.zeros(kernels.SUMS), 0
+    for level in reversed(levels):
         photometry.color_scale, photometry.depth_scale = 0.05, 2.0
-        gate = config.gate if number == 0 else 2 * config.gate
-        for _ in range(config.iterations[number]):
-            H, g, stats = kernels.normal_equations(
-                points[number], level.intensity, level.depth, focal, center,
-                T[:3, :3].astype(np.float32), T[:3, 3].astype(np.float32),
-                np.float32(photometry.gain), np.float32(photometry.offset), np.float32(photometry.color_scale),
-                np.float32(photometry.depth_scale), np.float32(gate), np.float32(1.0), np.float32(config.depth_weight),
-                np.float32(config.sigma_floor), np.float32(config.sigma_slope),
-            )  # fmt: skip
-            photometry.refit(stats)
-            step = _step(H, g)
-            T = se3.exp(torch.from_numpy(step)).numpy() @ T
+        for _ in range(level.passes):
+            sums = kernels.normal_equations(level.points, level.live, _constants(level, T, photometry, config))
+            photometry.refit(sums)
+            step = _step(sums)
+            T = _exp(step) @ T
             passes += 1
-            if np.linalg.norm(step[:3]) < 3e-4 and np.linalg.norm(step[3:]) < 3e-4 and number > 0:
+            if np.linalg.norm(step[:3]) < 3e-4 and np.linalg.norm(step[3:]) < 3e-4 and level is not finest:
                 break
-    finest = next(number for number, passes_there in enumerate(config.iterations) if passes_there)
-    readings = float(stats[kernels.READINGS])
+    readings = float(sums[kernels.READINGS])
     return Alignment(
         T_map_cam=T_map_ref @ se3.inverse(torch.from_numpy(T)),
         iterations=passes,
-        color_residual=photometry.color_scale,
-        depth_residual=photometry.depth_scale,
-        overlap=float(stats[kernels.IN_VIEW]) / max(len(points[finest]), 1),
-        agreement=float(stats[kernels.AGREEING]) / readings if readings else 1.0,
+        overlap=float(sums[kernels.IN_VIEW]) / max(int(np.count_nonzero(finest.points[kernels.PZ])), 1),
+        agreement=float(sums[kernels.AGREEING]) / readings if readings else 1.0,
         correlation=correlation(
-            *(float(stats[k]) for k in (kernels.GAIN_W, kernels.GAIN_R, kernels.GAIN_L)),
-            *(float(stats[k]) for k in (kernels.GAIN_RR, kernels.GAIN_RL, kernels.GAIN_LL)),
+            *(float(sums[k]) for k in (kernels.GAIN_W, kernels.GAIN_R, kernels.GAIN_L)),
+            *(float(sums[k]) for k in (kernels.GAIN_RR, kernels.GAIN_RL, kernels.GAIN_LL)),
         ),
     )

@@ -440,7 +440,7 @@ def log2(typingctx: Any, a: Any) -> Any:
 def gather(typingctx: Any, array: Any, start: Any, index: Any) -> Any:
     """Lane by lane `array[start + index]` of a flat float32 array; the index is truncated.
 
-    Sixteen loads, which are faster here than the processor's own gather (5.9 against 9.2 ns on a Zen 5) and work anywhere.
+    Sixteen loads: they work anywhere, and a Zen 5 takes 5.9 ns for them, 9.2 ns for its own gather.
     """
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
