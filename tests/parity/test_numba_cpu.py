@@ -1,6 +1,10 @@
 """The CPU backend against the oracle, forward and backward, and its promise of equal bits."""
 
 import math
+import os
+import platform
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -148,3 +152,26 @@ def test_visible_is_a_footprint_with_a_pixel():
     drawn = draw(NumbaRasterizer(), {k: (v if k == "T_cam_map" else v.float()) for k, v in inputs.items()}).visible
     assert torch.equal(flags, drawn)
     assert 0 < int(flags.sum()) < 400
+
+
+def test_images_that_were_changed_in_place_are_not_differentiated():
+    inputs = {k: (v if k == "T_cam_map" else v.float()).requires_grad_() for k, v in random_inputs(50, 9).items()}
+    raster = draw(NumbaRasterizer(), inputs)
+    raster.alpha.mul_(2.0)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        raster.depth.sum().backward()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names instruction sets of x86")
+@pytest.mark.parametrize("features", ["", "+avx,+avx2,+fma,+bmi,+bmi2,+lzcnt,+popcnt"], ids=["sse2", "avx2"])
+def test_processors_without_wide_vectors_agree_with_the_oracle(features: str, tmp_path):
+    """In a process of its own, because numba compiles for one processor."""
+    environment = {
+        **os.environ, "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": features, "NUMBA_CACHE_DIR": str(tmp_path),
+    }  # fmt: skip
+    tests = [f"{__file__}::{test.__name__}" for test in (test_a_lone_splat_is_equation_3, test_nothing_to_draw)]
+    tests += [f"{__file__}::test_forward_and_backward_agree_with_the_oracle[True-1]"]
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout

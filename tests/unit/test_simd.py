@@ -94,15 +94,31 @@ def test_append_where_bit_keeps_order_and_length(length):
 
 @njit
 def _integers(values, out):
-    simd.store_as_int32(out, 0, simd.load(values, 0))
+    simd.store_int32_pairs(out, 0, simd.load(values, 0), simd.load(values, 0) * np.float32(2))
     return simd.trailing_zeros(np.int32(40))
 
 
 def test_integers():
-    out = np.zeros(16, np.int32)
+    out = np.zeros(32, np.int32)
     values = np.linspace(-3, 40, 16).astype(np.float32)
     assert _integers(values, out) == int(math.log2(8))
-    np.testing.assert_array_equal(out, values.astype(np.int32))
+    np.testing.assert_array_equal(out[0::2], values.astype(np.int32))
+    np.testing.assert_array_equal(out[1::2], (2 * values).astype(np.int32))
+
+
+@njit(fastmath=simd.MATH)
+def _regroup(blocks, out):
+    rows = simd.regrouped(simd.load(blocks, 0), simd.load(blocks, 16), simd.load(blocks, 32), simd.load(blocks, 48))
+    for k in range(4):
+        simd.store(out, 16 * k, rows[k])
+
+
+def test_regrouped_makes_rows_of_pixels_from_blocks_and_back():
+    blocks, rows, back = np.arange(64, dtype=np.float32), np.zeros(64, np.float32), np.zeros(64, np.float32)
+    _regroup(blocks, rows)
+    np.testing.assert_array_equal(rows.reshape(4, 4, 4), blocks.reshape(4, 4, 4).transpose(1, 0, 2))
+    _regroup(rows, back)
+    np.testing.assert_array_equal(back, blocks)
 
 
 @njit(fastmath=simd.MATH)

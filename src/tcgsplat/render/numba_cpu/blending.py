@@ -12,7 +12,7 @@ a stored transmittance: with d_i = f_i . dL/dout, dL/dalpha_i = T_i d_i - (sum_{
 import math
 
 import numpy as np
-from numba import njit
+from numba import carray, njit
 
 from tcgsplat.render.numba_cpu.layout import (
     BLOCK_X,
@@ -31,12 +31,15 @@ from tcgsplat.render.numba_cpu.layout import (
     RIDGE_Y,
     SLOPE_U,
     SLOPE_V,
+    SPLAT,
     TILE,
     TILE_FLOATS,
+    TILE_PIXELS,
     U,
     V,
 )
 from tcgsplat.render.numba_cpu.simd import (
+    INNER,
     MATH,
     append_where_bit,
     exp2,
@@ -47,7 +50,9 @@ from tcgsplat.render.numba_cpu.simd import (
     maximum,
     minimum,
     prefetch,
+    regrouped,
     spread,
+    stack_floats,
     store,
     trailing_zeros,
     where_ge,
@@ -56,10 +61,12 @@ from tcgsplat.render.protocol import MIN_ALPHA, MIN_TRANSMITTANCE
 
 _LOG2_MIN_ALPHA = np.float32(math.log2(MIN_ALPHA))
 _MIN_TRANSMITTANCE = np.float32(MIN_TRANSMITTANCE)
+BACKWARD_FLOATS = 2 * (TILE_PIXELS + TILE_FLOATS)
+"""Length of the `local` that `backward` needs."""
 _AHEAD = 24  # records asked for in advance: about the latency of memory over the time of one ellipse test
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always")
+@njit(fastmath=MATH, **INNER, inline="always")
 def _blocks_touched(records, at, origin_x, origin_y, grid):
     """Mask of the blocks in which log2 alpha reaches its threshold at some point of the block's pixel rectangle.
 
@@ -79,23 +86,23 @@ def _blocks_touched(records, at, origin_x, origin_y, grid):
     return mask_ge(maximum(on_column, on_row), spread(_LOG2_MIN_ALPHA - records[at + RECORD_LOG2_OPACITY]))
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
-def forward(tile_from, tile_to, tile_ends, pair_splats, records, tiles_x, grid, masks, image):
-    """Composite a range of tiles into `image` (tile layout) and leave in `masks` the blocks that each pair drew."""
-    longest = np.int64(0)
-    for tile in range(tile_from, tile_to):
-        longest = max(longest, np.int64(tile_ends[tile + 1]) - np.int64(tile_ends[tile]))
-    local = np.empty((longest + 1) * RECORD + 16, np.float32)
-    local_masks, pair_of, block_list = np.empty(longest + 16, np.int32), np.empty(longest + 16, np.int32), np.empty(longest + 16, np.int32)
-    last_pair = np.int64(pair_splats.size - 1)
+@njit(fastmath=MATH, **INNER)
+def forward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, height, grid, local, lists, masks, planes):
+    """Composite a range of tiles into `planes` and leave in `masks` the blocks that each pair drew.
+
+    `local` and the three `lists` are this thread's own, for the records and the numbers of a tile's splats.
+    """
+    blocks = carray(stack_floats(1792), TILE_FLOATS)
+    local_masks, pair_of, block_list = lists[0], lists[1], lists[2]
+    last_pair = np.int64(tile_ends[tile_ends.size - 1]) - 1
     threshold, zero, one = spread(_LOG2_MIN_ALPHA), spread(np.float32(0)), spread(np.float32(1))
     for tile in range(tile_from, tile_to):
         origin_x, origin_y = np.float32((tile % tiles_x) * TILE), np.float32((tile // tiles_x) * TILE)
         begin, end = np.int64(tile_ends[tile]), np.int64(tile_ends[tile + 1])
         count = np.int64(0)
         for pair in range(begin, end):
-            prefetch(records, np.int64(pair_splats[min(pair + _AHEAD, last_pair)]) * RECORD)
-            at = np.int64(pair_splats[pair]) * RECORD
+            prefetch(records, (pairs[min(pair + _AHEAD, last_pair)] & SPLAT) * RECORD)
+            at = (pairs[pair] & SPLAT) * RECORD
             touched = _blocks_touched(records, at, origin_x, origin_y, grid)
             masks[pair] = touched
             local_masks[count] = touched
@@ -132,70 +139,70 @@ def forward(tile_from, tile_to, tile_ends, pair_splats, records, tiles_x, grid, 
                     for j in range(group, listed):
                         masks[pair_of[block_list[j]]] &= ~bit
                     break
-            out = np.int64(tile) * TILE_FLOATS + block * 16
-            store(image, out, c0)
-            store(image, out + 256, c1)
-            store(image, out + 512, c2)
-            store(image, out + 768, c3)
-            store(image, out + 1024, cz)
-            store(image, out + 1280, cp)
-            store(image, out + 1536, one - T)
+            out = block * 16
+            store(blocks, out, c0)
+            store(blocks, out + 256, c1)
+            store(blocks, out + 512, c2)
+            store(blocks, out + 768, c3)
+            store(blocks, out + 1024, cz)
+            store(blocks, out + 1280, cp)
+            store(blocks, out + 1536, one - T)
+        _blocks_to_planes(blocks, tile, tiles_x, width, height, planes, local)
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
-def backward(tile_from, tile_to, tile_ends, pair_splats, records, tiles_x, grid, masks, image, d_image, pair_sums):
-    """Sums over pixels for each pair of a range of tiles, sixteen floats a pair, from the loss's derivative by the image.
+@njit(fastmath=MATH, **INNER)
+def backward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, height, grid, masks, planes, d_planes, local, pair_sums):
+    """Sums over pixels for each pair of a range of tiles, sixteen floats a slot, from the loss's derivative by the planes.
 
     With g = dL/d ln(alpha), dx = pixel - centre and w the compositing weight, the sums are
     g, g dx, g dy, g dx^2, g dx dy, g dy^2, w D_feature (4), w D_depth, w D_plane, w D_plane dx, w D_plane dy.
+    `local` is this thread's own.
     """
-    transmittance, remaining = np.empty(256 + 16, np.float32), np.empty(256 + 16, np.float32)
+    d_blocks = carray(stack_floats(1792), TILE_FLOATS)
+    transmittance, remaining = local[:TILE_PIXELS], local[TILE_PIXELS : 2 * TILE_PIXELS]
+    clipped, d_clipped = local[2 * TILE_PIXELS : 2 * TILE_PIXELS + TILE_FLOATS], local[2 * TILE_PIXELS + TILE_FLOATS : BACKWARD_FLOATS]
+    last_pair = np.int64(tile_ends[tile_ends.size - 1]) - 1
     threshold, zero, one = spread(_LOG2_MIN_ALPHA), spread(np.float32(0)), spread(np.float32(1))
     lane_x, lane_y = load(grid, LANE_X), load(grid, LANE_Y)
     for tile in range(tile_from, tile_to):
-        origin_x, origin_y = np.float32((tile % tiles_x) * TILE), np.float32((tile // tiles_x) * TILE)
-        base = np.int64(tile) * TILE_FLOATS
+        x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        origin_x, origin_y = np.float32(x0), np.float32(y0)
+        if x0 + TILE <= width and y0 + TILE <= height:
+            _to_blocks(planes, d_planes, y0 * width + x0, width, width * height, d_blocks, remaining)
+        else:
+            _clip(planes, x0, y0, width, height, clipped)
+            _clip(d_planes, x0, y0, width, height, d_clipped)
+            _to_blocks(clipped, d_clipped, np.int64(0), np.int64(TILE), np.int64(TILE_PIXELS), d_blocks, remaining)
         for block in range(16):
-            total = zero
-            for channel in range(CHANNELS):
-                at = base + channel * 256 + block * 16
-                total = fma(load(image, at), load(d_image, at), total)
-            store(remaining, block * 16, total)
             store(transmittance, block * 16, one)
-        begin, end = np.int64(tile_ends[tile]), np.int64(tile_ends[tile + 1])
-        for pair in range(begin, end):
-            mask = masks[pair]
-            prefetch(records, np.int64(pair_splats[min(pair + 8, end - 1)]) * RECORD)
-            if mask == 0:
-                continue
-            at = np.int64(pair_splats[pair]) * RECORD
-            u, v = spread(records[at + U] - origin_x), spread(records[at + V] - origin_y)
-            A, B, C = spread(records[at + FORM_A]), spread(records[at + FORM_B]), spread(records[at + FORM_C])
-            log2_opacity = spread(records[at + RECORD_LOG2_OPACITY])
-            f0, f1 = spread(records[at + RECORD_FEATURE]), spread(records[at + RECORD_FEATURE + 1])
-            f2, f3 = spread(records[at + RECORD_FEATURE + 2]), spread(records[at + RECORD_FEATURE + 3])
-            z, slope_u, slope_v = spread(records[at + DEPTH]), spread(records[at + SLOPE_U]), spread(records[at + SLOPE_V])
+        for pair in range(tile_ends[tile], tile_ends[tile + 1]):
+            prefetch(records, (pairs[min(pair + 8, last_pair)] & SPLAT) * RECORD)
+            at = (pairs[pair] & SPLAT) * RECORD
+            from_center_x, from_center_y = lane_x - (records[at + U] - origin_x), lane_y - (records[at + V] - origin_y)
             g, gx, gy, gxx, gxy, gyy = zero, zero, zero, zero, zero, zero
             w0, w1, w2, w3, wz, wp, wpx, wpy = zero, zero, zero, zero, zero, zero, zero, zero
+            mask = masks[pair]
             while mask != 0:
                 block = trailing_zeros(mask)
                 mask &= mask - np.int32(1)
-                dx, dy = lane_x - u + grid[BLOCK_X + block], lane_y - v + grid[BLOCK_Y + block]
-                log2_alpha = fma(fma(A, dx, B * dy), dx, fma(C * dy, dy, log2_opacity))
+                dx, dy = from_center_x + grid[BLOCK_X + block], from_center_y + grid[BLOCK_Y + block]
+                row = fma(spread(records[at + FORM_C]) * dy, dy, spread(records[at + RECORD_LOG2_OPACITY]))
+                log2_alpha = fma(fma(spread(records[at + FORM_A]), dx, spread(records[at + FORM_B]) * dy), dx, row)
                 alpha = where_ge(log2_alpha, threshold, exp2(log2_alpha), zero)
                 lanes = block * 16
                 T = load(transmittance, lanes)
                 weight = alpha * T
                 store(transmittance, lanes, T - weight)
-                out = base + lanes
-                D0, D1, D2, D3 = load(d_image, out), load(d_image, out + 256), load(d_image, out + 512), load(d_image, out + 768)
-                Dz, Dp = load(d_image, out + 1024), load(d_image, out + 1280)
-                plane = fma(slope_u, dx, fma(slope_v, dy, z))
-                d = fma(plane, Dp, fma(z, Dz, load(d_image, out + 1536)))
-                d = fma(f3, D3, fma(f2, D2, fma(f1, D1, fma(f0, D0, d))))
+                D0, D1, D2, D3 = load(d_blocks, lanes), load(d_blocks, lanes + 256), load(d_blocks, lanes + 512), load(d_blocks, lanes + 768)
+                Dz, Dp = load(d_blocks, lanes + 1024), load(d_blocks, lanes + 1280)
+                z = spread(records[at + DEPTH])
+                plane = fma(spread(records[at + SLOPE_U]), dx, fma(spread(records[at + SLOPE_V]), dy, z))
+                d = fma(plane, Dp, fma(z, Dz, load(d_blocks, lanes + 1536)))
+                d = fma(spread(records[at + RECORD_FEATURE + 1]), D1, fma(spread(records[at + RECORD_FEATURE]), D0, d))
+                d = fma(spread(records[at + RECORD_FEATURE + 3]), D3, fma(spread(records[at + RECORD_FEATURE + 2]), D2, d))
                 behind = load(remaining, lanes) - weight * d
                 store(remaining, lanes, behind)
-                d_ln_alpha = alpha * (T * d - behind / (one - alpha))
+                d_ln_alpha = weight * d - behind * (alpha / (one - alpha))
                 mx, my = d_ln_alpha * dx, d_ln_alpha * dy
                 g, gx, gy = g + d_ln_alpha, gx + mx, gy + my
                 gxx, gxy, gyy = fma(mx, dx, gxx), fma(mx, dy, gxy), fma(my, dy, gyy)
@@ -203,61 +210,65 @@ def backward(tile_from, tile_to, tile_ends, pair_splats, records, tiles_x, grid,
                 weighted = weight * Dp
                 wz, wp = fma(weight, Dz, wz), wp + weighted
                 wpx, wpy = fma(weighted, dx, wpx), fma(weighted, dy, wpy)
-            store(pair_sums, pair * RECORD, lane_sums((g, gx, gy, gxx, gxy, gyy, w0, w1, w2, w3, wz, wp, wpx, wpy)))
+            sums = lane_sums((g, gx, gy, gxx, gxy, gyy, w0, w1, w2, w3, wz, wp, wpx, wpy))
+            store(pair_sums, (pairs[pair] >> 32) * RECORD, sums)
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
-def gather_sums(start, stop, first, slot_starts, slot_pairs, masks, pair_sums, sums):
-    """Each splat's pairs summed in the order of its tiles: the same bits whatever threads made the pairs."""
-    last = np.int64(slot_starts[stop])
-    for slot in range(slot_starts[start], min(last, np.int64(slot_starts[start]) + _AHEAD)):
-        prefetch(pair_sums, np.int64(slot_pairs[slot]) * RECORD)
-    for i in range(start, stop):
-        total = spread(np.float32(0))
-        for slot in range(slot_starts[i], slot_starts[i + 1]):
-            prefetch(pair_sums, np.int64(slot_pairs[min(slot + _AHEAD, last - 1)]) * RECORD)
-            pair = np.int64(slot_pairs[slot])
-            if masks[pair] != 0:
-                total = total + load(pair_sums, pair * RECORD)
-        store(sums, (i - first) * RECORD, total)
-
-
-@njit(error_model="numpy", nogil=True, cache=True)
-def to_planes(tile_from, tile_to, tiles_x, width, height, image, planes):  # type: ignore[no-untyped-def]
-    """Tile layout to [CHANNELS, height, width], four pixels of a block's row at a time."""
-    for tile in range(tile_from, tile_to):
-        x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        columns, rows = min(TILE, width - x0), min(TILE, height - y0)
-        for channel in range(CHANNELS):
-            base = tile * TILE_FLOATS + channel * 256
-            for y in range(rows):
-                row, out = base + (y >> 2) * 64 + (y & 3) * 4, planes[channel, y0 + y]
-                if columns == TILE:
-                    for block in range(4):
-                        for x in range(4):
-                            out[x0 + block * 4 + x] = image[row + block * 16 + x]
-                else:
+@njit(fastmath=MATH, **INNER)
+def _blocks_to_planes(blocks, tile, tiles_x, width, height, planes, rows):
+    """A tile's blocks to its rows of the planes, one row of blocks at a time; `rows` has space for one."""
+    x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    columns, lines = min(TILE, width - x0), min(TILE, height - y0)
+    for channel in range(CHANNELS):
+        for y in range(0, lines, 4):
+            at = channel * TILE_PIXELS + y * TILE
+            r0, r1, r2, r3 = regrouped(load(blocks, at), load(blocks, at + 16), load(blocks, at + 32), load(blocks, at + 48))
+            out = (channel * height + y0 + y) * width + x0
+            if columns == TILE and y + 4 <= lines:
+                store(planes, out, r0)
+                store(planes, out + width, r1)
+                store(planes, out + 2 * width, r2)
+                store(planes, out + 3 * width, r3)
+            else:
+                store(rows, 0, r0)
+                store(rows, 16, r1)
+                store(rows, 32, r2)
+                store(rows, 48, r3)
+                for line in range(min(4, lines - y)):
                     for x in range(columns):
-                        out[x0 + x] = image[row + (x >> 2) * 16 + (x & 3)]
+                        planes[out + line * width + x] = rows[line * 16 + x]
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
-def to_tiles(tile_from, tile_to, tiles_x, width, height, planes, image):  # type: ignore[no-untyped-def]
-    """[CHANNELS, height, width] to tile layout; pixels of a tile that hang over the image's edge become 0."""
-    for tile in range(tile_from, tile_to):
-        x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        columns, rows = min(TILE, width - x0), min(TILE, height - y0)
+@njit(**INNER)
+def _clip(planes, x0, y0, width, height, out):  # type: ignore[no-untyped-def]
+    """A tile that hangs over the image's edge, row by row; zeros beyond the edge."""
+    for k in range(TILE_FLOATS):
+        out[k] = np.float32(0)
+    for channel in range(CHANNELS):
+        for y in range(min(TILE, height - y0)):
+            for x in range(min(TILE, width - x0)):
+                out[(channel * TILE + y) * TILE + x] = planes[(channel * height + y0 + y) * width + x0 + x]
+
+
+@njit(fastmath=MATH, **INNER)
+def _to_blocks(planes, d_planes, start, pitch, plane, d_blocks, products):
+    """A tile's rows of `d_planes` to blocks, and by pixel the product with `planes`, summed over the channels."""
+    zero = spread(np.float32(0))
+    for band in range(4):
+        p0, p1, p2, p3 = zero, zero, zero, zero
         for channel in range(CHANNELS):
-            base = tile * TILE_FLOATS + channel * 256
-            if columns < TILE or rows < TILE:
-                for k in range(256):
-                    image[base + k] = np.float32(0)
-            for y in range(rows):
-                row, source = base + (y >> 2) * 64 + (y & 3) * 4, planes[channel, y0 + y]
-                if columns == TILE:
-                    for block in range(4):
-                        for x in range(4):
-                            image[row + block * 16 + x] = source[x0 + block * 4 + x]
-                else:
-                    for x in range(columns):
-                        image[row + (x >> 2) * 16 + (x & 3)] = source[x0 + x]
+            at = start + channel * plane + band * 4 * pitch
+            d0, d1, d2, d3 = load(d_planes, at), load(d_planes, at + pitch), load(d_planes, at + 2 * pitch), load(d_planes, at + 3 * pitch)
+            p0, p1 = fma(load(planes, at), d0, p0), fma(load(planes, at + pitch), d1, p1)
+            p2, p3 = fma(load(planes, at + 2 * pitch), d2, p2), fma(load(planes, at + 3 * pitch), d3, p3)
+            b0, b1, b2, b3 = regrouped(d0, d1, d2, d3)
+            out = channel * TILE_PIXELS + band * 64
+            store(d_blocks, out, b0)
+            store(d_blocks, out + 16, b1)
+            store(d_blocks, out + 32, b2)
+            store(d_blocks, out + 48, b3)
+        b0, b1, b2, b3 = regrouped(p0, p1, p2, p3)
+        store(products, band * 64, b0)
+        store(products, band * 64 + 16, b1)
+        store(products, band * 64 + 32, b2)
+        store(products, band * 64 + 48, b3)

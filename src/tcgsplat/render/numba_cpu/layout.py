@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
+Counts = npt.NDArray[np.uint32]
 
 # Rows of the parameter matrix.
 MEAN, QUAT, SCALE, LOG2_OPACITY, FEATURE = 0, 3, 7, 10, 11
@@ -32,6 +33,12 @@ BLOCK = 4
 BLOCK_PIXELS = BLOCK * BLOCK
 TILE_PIXELS = TILE * TILE
 TILE_FLOATS = CHANNELS * TILE_PIXELS
+
+SPAN_UNIT = 1 << 12
+"""A splat's rectangle of tiles is two integers: its first tile, and (columns - 1) + SPAN_UNIT * (rows - 1)."""
+
+SPLAT = 0xFFFFFFFF
+"""The lower half of a list's 64-bit entry is a splat: a sorting key over a splat, or a slot over a splat."""
 
 # Entries of the camera vector: rotation (row by row), translation, intrinsics, limits of x/z and y/z, image limits.
 ROTATION, TRANSLATION, FOCAL, CENTER, SLOPE_LIMITS, LAST_PIXEL = 0, 9, 12, 14, 16, 20

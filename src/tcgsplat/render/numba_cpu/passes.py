@@ -1,58 +1,103 @@
 """The two passes over arrays: parameters to images, and the images' derivatives back to parameters and pose.
 
 Results do not depend on the number of threads: a tile is drawn by one thread, pairs are summed splat by splat in a
-fixed order, and pose sums over fixed chunks of splats.
+fixed order, and pose sums over fixed units of splats.
 """
 
+import time
+import weakref
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.render.numba_cpu import blending, projection, tiling
+from tcgsplat.render.numba_cpu import pass_kernels as kernels
+from tcgsplat.render.numba_cpu import projection, tiling
+from tcgsplat.render.numba_cpu.blending import BACKWARD_FLOATS
 from tcgsplat.render.numba_cpu.layout import (
     CAMERA,
     CHANNELS,
     LANE_GRID,
     PARAMETERS,
     RECORD,
+    SPLAT,
     TILE,
-    TILE_FLOATS,
+    Counts,
     Floats,
     Ints,
     aligned,
 )
+from tcgsplat.render.numba_cpu.phases import COUNTERS
 from tcgsplat.render.numba_cpu.workers import Workers, available_cores
 from tcgsplat.render.protocol import JACOBIAN_MARGIN
 
-_CHUNK = 4096
-"""Splats per unit of streaming work. Fixed, because pose sums are made chunk by chunk."""
+Arguments = tuple[Any, ...]
+
+
+class Workspace:
+    """Arrays by name that are made once and used again; one pass at a time may hold it."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, npt.NDArray[np.generic]] = {}
+
+    def floats(self, name: str, *shape: int) -> Floats:
+        """Uninitialised float32 of this shape, aligned to cache lines."""
+        return self._array(name, shape, np.float32)  # type: ignore[return-value]
+
+    def ints(self, name: str, *shape: int) -> Ints:
+        """The same in int32."""
+        return self._array(name, shape, np.int32)  # type: ignore[return-value]
+
+    def counts(self, name: str, *shape: int) -> Counts:
+        """The same in uint32."""
+        return self._array(name, shape, np.uint32)  # type: ignore[return-value]
+
+    def longs(self, name: str, *shape: int) -> npt.NDArray[np.int64]:
+        """The same in int64."""
+        return self._array(name, shape, np.int64)  # type: ignore[return-value]
+
+    def _array(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[np.generic]:
+        size = int(np.prod(shape))
+        if name not in self._arrays or self._arrays[name].size < size:
+            self._arrays[name] = aligned(size + size // 4, dtype)  # room to grow
+        return self._arrays[name][:size].reshape(shape)
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A forward pass: what it shows, and what the backward pass needs."""
+    """A forward pass: what it shows, and what the backward pass needs.
+
+    Its arrays, except for `planes`, are used again by another pass once it is no longer referred to.
+    """
 
     padded: int
     parameters: Floats
     camera_vector: Floats
     tiles_x: int
     tile_ends: Ints
-    pair_splats: Ints
-    slot_starts: Ints
-    slot_pairs: Ints
+    pairs: npt.NDArray[np.int64]
+    """A slot over a splat, for each (splat, tile) pair, tile by tile and by depth."""
+    slot_starts: Counts
     records: Floats
+    depths: Floats
     masks: Ints
-    image: Floats
+    workspace: Workspace
     planes: Floats
-    """[CHANNELS, h, w]: the features, centre depth, plane depth, alpha."""
+    """[CHANNELS, h, w]: the features, centre depth, plane depth, alpha. The backward pass reads them again."""
 
     @property
     def visible(self) -> npt.NDArray[np.bool_]:
         """Whether each splat touches a tile, [padded]."""
-        return np.diff(self.slot_starts) > 0
+        return self.depths > 0
+
+    @property
+    def pair_splats(self) -> Ints:
+        """Which splat each pair is of."""
+        return (self.pairs[: self.tile_ends[-1]] & SPLAT).astype(np.int32)
 
 
 def camera_vector(camera: Camera, T_cam_map: npt.NDArray[np.float64]) -> Floats:
@@ -72,15 +117,17 @@ def camera_vector(camera: Camera, T_cam_map: npt.NDArray[np.float64]) -> Floats:
 
 
 class Passes:
-    """Forward and backward on some threads."""
+    """Forward and backward on some threads. Several callers may use them at the same time."""
 
-    def __init__(self, threads: int | None = None, lap: Callable[[str], object] = lambda _: None) -> None:
+    def __init__(self, threads: int | None = None, lap: Callable[[str], object] | None = None) -> None:
         """Passes on `threads` workers, by default as many as this process may run on.
 
-        `lap` is called with its name at the end of every stage: project, sort, bin, forward; backward, chain.
+        `lap` is called with its name at the end of every stage: project, sort, bin, forward; backward, chain. Between
+        stages all threads then meet, which they do not otherwise.
         """
         self._workers = Workers(threads or available_cores())
         self._lap = lap
+        self._idle: deque[Workspace] = deque()
         self._grid: Floats = aligned(LANE_GRID.shape)  # type: ignore[assignment]
         self._grid[:] = LANE_GRID
 
@@ -92,78 +139,107 @@ class Passes:
             camera: Intrinsics.
             T_cam_map: Map frame to camera frame, [4, 4]; used in float32.
         """
-        padded = parameters.shape[1]
-        cam = camera_vector(camera, T_cam_map)
-        workers, flat = self._workers, parameters.reshape(-1)
-        records: Floats = aligned(padded * RECORD)  # type: ignore[assignment]
-        depths: Floats = aligned(padded)  # type: ignore[assignment]
-        tiles: Ints = aligned(4 * padded, np.int32)  # type: ignore[assignment]
-        workers.run(
-            lambda a, b: projection.forward(flat, padded, a, b, cam, records, depths, tiles), workers.cuts(padded, 16)
-        )
-        self._lap("project")
-
-        tiles_x, tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
-        order = np.empty(padded, np.int32)
-        visible_count = tiling.depth_order(depths.view(np.uint32), tiles, padded, order)
-        self._lap("sort")
-        tile_ends = np.empty(tiles_x * tiles_y + 1, np.int32)
-        slot_starts = np.empty(padded + 1, np.int32)
-        pairs = tiling.count_pairs(tiles, padded, tiles_x, tile_ends, slot_starts)
-        pair_splats, slot_pairs = np.zeros(pairs + 1, np.int32), np.empty(pairs, np.int32)
-        tiling.fill_pairs(order, visible_count, tiles, padded, tiles_x, tile_ends, slot_starts, pair_splats, slot_pairs)
-        self._lap("bin")
-
-        masks = np.empty(pairs, np.int32)
-        image: Floats = aligned(tiles_x * tiles_y * TILE_FLOATS)  # type: ignore[assignment]
-        planes = np.empty((CHANNELS, camera.height, camera.width), np.float32)
-
-        def composite(a: int, b: int) -> None:
-            blending.forward(a, b, tile_ends, pair_splats, records, tiles_x, self._grid, masks, image)
-            blending.to_planes(a, b, tiles_x, camera.width, camera.height, image, planes)
-
-        workers.run(composite, workers.weighted_cuts(tile_ends))
-        self._lap("forward")
-        return Drawn(
-            padded, flat, cam, tiles_x, tile_ends, pair_splats, slot_starts, slot_pairs, records, masks, image, planes
+        space = self._workspace()
+        padded, width, height = parameters.shape[1], camera.width, camera.height
+        cam, flat = camera_vector(camera, T_cam_map), parameters.reshape(-1)
+        tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+        tiles, strips, units = tiles_x * tiles_y, self._workers.threads, -(-padded // kernels.UNIT)
+        records, depths = space.floats("records", padded * RECORD), space.floats("depths", padded)
+        rectangles, slot_starts = space.counts("rectangles", 2 * padded), space.counts("slot_starts", padded + 1)
+        entries, unit_sums = space.longs("entries", padded), space.longs("unit_sums", units, 3)
+        tile_counts, tile_ends = space.counts("tile_counts", strips, tiles + 1), space.ints("tile_ends", tiles + 1)
+        arranging = (
+            flat, padded, cam, tiles_x, records, depths, depths.view(np.int32), rectangles, unit_sums, slot_starts,
+            entries, space.longs("swapped", padded), space.counts("digit_counts", strips, tiling.DIGIT_VALUES),
+            space.ints("digit_ends", tiling.DIGIT_VALUES + 1), tile_counts, tile_ends,
+        )  # fmt: skip
+        self._run(
+            kernels.arrange,
+            {"project": kernels.PROJECT, "sort": kernels.COUNT_TILES - 1, "": kernels.PLACE_TILES},
+            lambda _: arranging,
+            space,
         )
 
-    def differentiate(self, drawn: Drawn, d_planes: Floats) -> tuple[Floats, npt.NDArray[np.float64]]:
-        """From the loss's derivative by the planes to those by the parameters [PARAMETERS, padded] and the pose [4, 4]."""
-        workers, padded = self._workers, drawn.padded
+        visible, pair_count, _ = (int(total) for total in unit_sums.sum(axis=0))
+        longest = int(np.diff(tile_ends).max())
+        pairs = space.longs("pairs", pair_count + kernels.SPARE * strips)
+        masks = space.ints("masks", pair_count)
+        local = space.floats("local", strips, max((longest + 1) * RECORD, BACKWARD_FLOATS))
+        lists = space.ints("lists", strips, 3, -(-(longest + 16) // 16) * 16)
+        planes = np.empty((CHANNELS, height, width), np.float32)
+        compositing = (
+            entries, visible, rectangles, slot_starts, tiles_x, tile_counts, tile_ends, pairs, records, width, height,
+            self._grid,
+        )  # fmt: skip
+        drawing = planes.reshape(-1)
+        self._run(
+            kernels.composite,
+            {"bin": kernels.FILL, "forward": kernels.FORWARD},
+            lambda worker: (*compositing, local[worker], lists[worker], masks, drawing),
+            space,
+        )
+        drawn = Drawn(padded, flat, cam, tiles_x, tile_ends, pairs, slot_starts, records, depths, masks, space, planes)
+        weakref.finalize(drawn, self._idle.append, space).atexit = False
+        return drawn
+
+    def differentiate(
+        self, drawn: Drawn, d_planes: Floats, grads: Floats | None = None
+    ) -> tuple[Floats, npt.NDArray[np.float64]]:
+        """From the loss's derivative by the planes to those by the parameters [PARAMETERS, padded] and the pose [4, 4].
+
+        `grads` is where to write the former; a new array if left out.
+        """
+        space, padded = drawn.workspace, drawn.padded
         _, height, width = d_planes.shape
-        d_image: Floats = aligned(drawn.image.size)  # type: ignore[assignment]
-        pair_sums: Floats = aligned(max(drawn.masks.size, 1) * RECORD)  # type: ignore[assignment]
-
-        def composite(a: int, b: int) -> None:
-            blending.to_tiles(a, b, drawn.tiles_x, width, height, d_planes, d_image)
-            blending.backward(
-                a, b, drawn.tile_ends, drawn.pair_splats, drawn.records, drawn.tiles_x, self._grid, drawn.masks,
-                drawn.image, d_image, pair_sums,
-            )  # fmt: skip
-
-        workers.run(composite, workers.weighted_cuts(drawn.tile_ends))
-        self._lap("backward")
-
-        grads: Floats = aligned((PARAMETERS, padded))  # type: ignore[assignment]
-        flat = grads.reshape(-1)
-        chunks = -(-padded // _CHUNK)
-        pose_sums = np.empty((chunks, projection.POSE_SUMS), np.float32)
-
-        def chain(a: int, b: int) -> None:
-            sums: Floats = aligned(_CHUNK * RECORD)  # type: ignore[assignment]
-            for chunk in range(a, b):
-                start, stop = chunk * _CHUNK, min((chunk + 1) * _CHUNK, padded)
-                blending.gather_sums(
-                    start, stop, start, drawn.slot_starts, drawn.slot_pairs, drawn.masks, pair_sums, sums
-                )
-                projection.backward(
-                    drawn.parameters, padded, start, stop, drawn.camera_vector, sums, start, flat, pose_sums[chunk]
-                )
-
-        workers.run(chain, workers.cuts(chunks))
-        pose = pose_sums.astype(np.float64).sum(axis=0)
+        pair_sums = space.floats("pair_sums", max(drawn.masks.size, 1) * RECORD)
+        pose_sums = space.floats("pose_sums", -(-padded // kernels.UNIT), projection.POSE_SUMS)
+        local = space.floats("local", self._workers.threads, BACKWARD_FLOATS)
+        out: Floats = aligned((PARAMETERS, padded)) if grads is None else grads  # type: ignore[assignment]
+        blending = (
+            drawn.tile_ends, drawn.pairs, drawn.records, drawn.tiles_x, width, height, self._grid, drawn.masks,
+            drawn.planes.reshape(-1), d_planes.reshape(-1),
+        )  # fmt: skip
+        chaining = (
+            pair_sums, drawn.parameters, padded, drawn.camera_vector, drawn.slot_starts, out.reshape(-1), pose_sums,
+        )  # fmt: skip
+        self._run(
+            kernels.differentiate,
+            {"backward": kernels.BACKWARD, "chain": kernels.CHAIN},
+            lambda worker: (*blending, local[worker], *chaining),
+            space,
+        )
+        pose = pose_sums.sum(axis=0, dtype=np.float64)
         d_T = np.zeros((4, 4))
         d_T[:3, :3], d_T[:3, 3] = pose[:9].reshape(3, 3), pose[9:]
-        self._lap("chain")
-        return grads, d_T
+        return out, d_T
+
+    def _workspace(self) -> Workspace:
+        try:
+            return self._idle.pop()
+        except IndexError:
+            return Workspace()
+
+    def _run(
+        self,
+        kernel: Callable[..., bool],
+        stages: dict[str, int],
+        arguments: Callable[[int], Arguments],
+        space: Workspace,
+    ) -> None:
+        """A kernel on all threads, in one go; for `lap` stage by stage, which are given with their last phases."""
+        last_phase = max(stages.values())
+        progress = space.longs("progress", (last_phase + 1) * COUNTERS)
+        progress[:] = 0
+
+        def work(worker: int) -> None:
+            own = arguments(worker)
+            while not kernel(progress, last_phase, *own):
+                time.sleep(0)
+
+        if self._lap is None:
+            self._workers.together(work)
+            return
+        for stage, last_phase in stages.items():  # noqa: B007  read by `work`
+            self._workers.together(work)
+            if stage:
+                self._lap(stage)

@@ -8,7 +8,7 @@ A derivative of the loss by `x` is called `d_x`.
 import math
 
 import numpy as np
-from numba import njit
+from numba import carray, njit
 
 from tcgsplat.render.numba_cpu.layout import (
     CENTER,
@@ -17,14 +17,18 @@ from tcgsplat.render.numba_cpu.layout import (
     LAST_PIXEL,
     LOG2_OPACITY,
     MEAN,
+    PARAMETERS,
     QUAT,
     RECORD,
     ROTATION,
     SCALE,
     SLOPE_LIMITS,
+    SPAN_UNIT,
+    TILE,
     TRANSLATION,
 )
 from tcgsplat.render.numba_cpu.simd import (
+    INNER,
     MATH,
     floor,
     load,
@@ -33,8 +37,9 @@ from tcgsplat.render.numba_cpu.simd import (
     minimum,
     spread,
     sqrt,
+    stack_floats,
     store,
-    store_as_int32,
+    store_int32_pairs,
     store_transposed,
     sum_lanes,
     where_ge,
@@ -46,13 +51,14 @@ _LOG2_MIN_ALPHA = np.float32(math.log2(MIN_ALPHA))
 _TWO_LN2 = np.float32(2 * math.log(2))
 _HALF_LOG2E = np.float32(-0.5 / math.log(2))
 _LN2 = np.float32(math.log(2))
-_ZERO, _ONE, _TWO, _TILE = np.float32(0), np.float32(1), np.float32(2), np.float32(1 / 16)
+_ZERO, _ONE, _TWO, _PER_TILE = np.float32(0), np.float32(1), np.float32(2), np.float32(1 / TILE)
+_SPAN_UNIT = np.float32(SPAN_UNIT)
 
 POSE_SUMS = 12
 """Numbers that `backward` sums for the pose: derivatives by the rotation (row by row) and the translation."""
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always")
+@njit(fastmath=MATH, **INNER, inline="always")
 def _expand(P, n, i, cam):
     """Centre in the camera, rows of J R, own axes as a rotation, and what they are made of."""
     R, t = ROTATION, TRANSLATION
@@ -83,7 +89,7 @@ def _expand(P, n, i, cam):
     )  # fmt: skip
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always")
+@njit(fastmath=MATH, **INNER, inline="always")
 def _axes(J, Q, cam):
     """N = J R R(q): image-space rows of the own axes, before scaling."""
     j00, j01, j02, j10, j11, j12 = J
@@ -96,7 +102,7 @@ def _axes(J, Q, cam):
     )  # fmt: skip
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always")
+@njit(fastmath=MATH, **INNER, inline="always")
 def _plane_and_footprint(m):
     """From scaled axes: cov(u, v); slopes of the plane, z regressed on (u, v); blurred variances and 1 / determinant."""
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = m
@@ -109,9 +115,9 @@ def _plane_and_footprint(m):
     return uv, (slope_u, slope_v, au, av, plane_inverse), (bu, bv, uv, _ONE / (bu * bv - uv * uv))
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
-def forward(P, n, start, stop, cam, records, depths, tiles):
-    """Records, depths and tile rectangles (x0, y0, x1, y1 as rows of `tiles`; x1 < x0: not visible) of a range."""
+@njit(fastmath=MATH, **INNER)
+def forward(P, n, start, stop, cam, tiles_x, records, depths, rectangles):
+    """Records, depths (0: not visible) and rectangles of tiles (see `layout.SPAN_UNIT`) of a range."""
     zero = spread(_ZERO)
     last_x, last_y = spread(cam[LAST_PIXEL]), spread(cam[LAST_PIXEL + 1])
     for i in range(start, stop, 16):
@@ -131,12 +137,11 @@ def forward(P, n, start, stop, cam, records, depths, tiles):
         x0, y0 = maximum(zero - floor(half_u - u), zero), maximum(zero - floor(half_v - v), zero)
         x1, y1 = minimum(floor(u + half_u), last_x), minimum(floor(v + half_v), last_y)
         seen = minimum(minimum(x1 - x0, y1 - y0), minimum(k, where_ge(spread(_NEAR), z_true, zero - _ONE, zero)))
-        one = spread(_ONE)
-        store_as_int32(tiles, i, where_ge(seen, zero, minimum(x0, last_x) * _TILE, one))
-        store_as_int32(tiles, n + i, where_ge(seen, zero, minimum(y0, last_y) * _TILE, one))
-        store_as_int32(tiles, 2 * n + i, where_ge(seen, zero, maximum(x1, zero) * _TILE, zero))
-        store_as_int32(tiles, 3 * n + i, where_ge(seen, zero, maximum(y1, zero) * _TILE, zero))
-        store(depths, i, z)
+        left, top = floor(minimum(x0, last_x) * _PER_TILE), floor(minimum(y0, last_y) * _PER_TILE)
+        columns, rows = floor(maximum(x1, zero) * _PER_TILE) - left, floor(maximum(y1, zero) * _PER_TILE) - top
+        first, span = top * np.float32(tiles_x) + left, rows * _SPAN_UNIT + columns
+        store_int32_pairs(rectangles, 2 * i, where_ge(seen, zero, first, zero), where_ge(seen, zero, span, zero))
+        store(depths, i, where_ge(seen, zero, z, zero))
         f = FEATURE
         store_transposed(records, i * RECORD, (
             u, v, A, B, C, log2_opacity, zero - B / (C * _TWO), zero - B / (A * _TWO),
@@ -145,19 +150,28 @@ def forward(P, n, start, stop, cam, records, depths, tiles):
         ))  # fmt: skip
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
-def backward(P, n, start, stop, cam, sums, first, grads, pose):
-    """From each splat's sums over its pixels to derivatives by its parameters and by the pose.
+@njit(fastmath=MATH, **INNER)
+def backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, pose):
+    """From each pair's sums over its pixels to derivatives by a range's parameters and by the pose.
 
-    `sums` holds rows of sixteen floats (see `blending.backward`), row g - first for Gaussian g; `grads` is laid out
-    like the parameters; `pose` receives POSE_SUMS numbers for the range start .. stop.
+    Splat i's pairs have the rows `slot_starts[i]` .. `slot_starts[i + 1]` of sixteen floats (see `blending.backward`);
+    `grads` is laid out like the parameters; `pose` receives POSE_SUMS numbers.
     """
-    zero = spread(_ZERO)
+    zero, sums = spread(_ZERO), carray(stack_floats(256), 256)
     p00, p01, p02, p10, p11, p12 = zero, zero, zero, zero, zero, zero
     p20, p21, p22, pt0, pt1, pt2 = zero, zero, zero, zero, zero, zero
     R = ROTATION
     for i in range(start, stop, 16):
-        S = load_transposed(sums, (i - first) * RECORD)
+        if slot_starts[i] == slot_starts[i + 16]:
+            for row in range(PARAMETERS):
+                store(grads, row * n + i, zero)
+            continue
+        for k in range(16):
+            total = zero
+            for slot in range(np.int64(slot_starts[i + k]), np.int64(slot_starts[i + k + 1])):
+                total = total + load(pair_sums, slot * RECORD)
+            store(sums, k * RECORD, total)
+        S = load_transposed(sums, 0)
         s, sx, sy, sxx, sxy, syy = S[0], S[1], S[2], S[3], S[4], S[5]
         d_z, d_plane, plane_x, plane_y = S[10], S[11], S[12], S[13]
         (X, Y, Z), (x, y, z_true, z, iz), (a, b, a_c, b_c), (ju, jv), J, (w, p, q, r, inverse_length), Q = _expand(P, n, i, cam)

@@ -47,7 +47,7 @@ class NumbaRasterizer:
 
     name = "numba"
 
-    def __init__(self, threads: int | None = None, lap: Callable[[str], object] = lambda _: None) -> None:
+    def __init__(self, threads: int | None = None, lap: Callable[[str], object] | None = None) -> None:
         """A rasterizer on the CPU.
 
         Args:
@@ -57,7 +57,7 @@ class NumbaRasterizer:
         """
         self.device = torch.device("cpu")
         self.passes = Passes(threads, lap)
-        self.lap = lap
+        self.lap = lap or (lambda _: None)
 
     def __call__(self, splats: Splats, camera: Camera, T_cam_map: Pose) -> Raster:
         """Draw; see `Rasterizer`."""
@@ -97,14 +97,15 @@ class _Draw(torch.autograd.Function):
         rasterizer.lap("pack")
         drawn = rasterizer.passes.draw(parameters, camera, T_cam_map.detach().to(torch.float64).numpy())
         visible_tensor = torch.from_numpy(drawn.visible[: len(means)])
+        planes = torch.from_numpy(drawn.planes)
         ctx.rasterizer, ctx.drawn, ctx.pose_dtype, ctx.channels = rasterizer, drawn, T_cam_map.dtype, features.shape[1]
-        ctx.save_for_backward(opacities)
+        ctx.save_for_backward(opacities, planes)  # planes only so that torch sees when they were changed in place
         ctx.mark_non_differentiable(visible_tensor)
-        return torch.from_numpy(drawn.planes), visible_tensor
+        return planes, visible_tensor
 
     @staticmethod
-    def backward(ctx: Any, d_planes: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
-        (opacities,) = ctx.saved_tensors
+    def backward(ctx: Any, d_planes: Tensor, _d_visible: Tensor) -> tuple[Tensor | None, ...]:
+        opacities, _ = ctx.saved_tensors
         ctx.rasterizer.lap("autograd")
         grads, d_T = ctx.rasterizer.passes.differentiate(ctx.drawn, d_planes.contiguous().numpy())
         n = len(opacities)

@@ -1,125 +1,162 @@
-"""Which splats each tile must draw, in order of depth: an exact radix sort of all splats, then counting into tiles."""
+"""Which splats each tile must draw, in order of depth: an exact radix sort of all splats, then counting into tiles.
+
+All is shared over strips, consecutive ranges of splats: each counts on its own, the counts of all become places, and
+each fills its places. The outcome, a stable order, is the same however the strips are cut.
+
+Places are kept in unsigned integers, which as indices need no test for the end that negative ones count from.
+"""
 
 import numpy as np
 from numba import njit
 
-_LOW = np.uint32(2047)
-_MIDDLE, _HIGH = np.uint32(11), np.uint32(22)
+from tcgsplat.render.numba_cpu.layout import SPAN_UNIT, SPLAT
+from tcgsplat.render.numba_cpu.simd import INNER, prefetch
+from tcgsplat.render.protocol import NEAR_PLANE
+
+DIGIT_BITS = 13
+DIGIT_VALUES = 1 << DIGIT_BITS
+_DIGIT_MASK = DIGIT_VALUES - 1
+_AHEAD = 24  # splats asked for in advance: in order of depth they are anywhere in memory
+_BEYOND_TWO = ~(1 | SPAN_UNIT)
+_NEAREST = int(np.float32(NEAR_PLANE).view(np.int32))
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
-def depth_order(depth_bits, tiles, n, order):
-    """Fill `order` with the visible splats, nearest first, ties by index; gives how many.
+@njit(**INNER)
+def tally(start, stop, depth_bits, rectangles, sums):  # type: ignore[no-untyped-def]
+    """Of a range: visible splats, (splat, tile) pairs, and the largest sorting key."""
+    visible, pairs, largest = np.int64(0), np.int64(0), np.int64(0)
+    for i in range(start, stop):
+        if depth_bits[i] > 0:
+            span = np.int64(rectangles[2 * i + 1])
+            visible += 1
+            pairs += ((span & (SPAN_UNIT - 1)) + 1) * ((span >> 12) + 1)
+            largest = max(largest, np.int64(depth_bits[i]) - _NEAREST)
+    sums[0], sums[1], sums[2] = visible, pairs, largest
 
-    Positive floats sort like their bits; three passes of eleven bits each keep earlier order, so the sort is exact and
-    stable.
+
+@njit(**INNER)
+def used_digits(sums):  # type: ignore[no-untyped-def]
+    """How many digits to sort by: an even number, so that the entries end where they began; two nearly always."""
+    largest = np.int64(0)
+    for k in range(sums.shape[0]):
+        largest = max(largest, sums[k, 2])
+    return 4 if largest >> (2 * DIGIT_BITS) else 2
+
+
+@njit(**INNER)
+def list_visible(start, stop, at, slot, depth_bits, rectangles, entries, counts, slot_starts):  # type: ignore[no-untyped-def]
+    """List the visible splats of a range from `entries[at]` on, count their keys' first digits, and number their slots.
+
+    An entry is a key over a splat. Positive floats sort like their bits; less those of the near plane, which is the
+    nearest that is visible, keys of rooms (up to 51 m) have two digits of thirteen bits.
     """
-    counts = np.zeros((3, 2048), np.int64)
-    keys, swap_keys = np.empty(n, np.uint32), np.empty(n, np.uint32)
-    swap = np.empty(n, np.int32)
-    m = 0
-    for i in range(n):
-        if tiles[2 * n + i] >= tiles[i]:
-            key = depth_bits[i]
-            keys[m] = key
-            order[m] = i
-            m += 1
-            counts[0, key & _LOW] += 1
-            counts[1, (key >> _MIDDLE) & _LOW] += 1
-            counts[2, key >> _HIGH] += 1
-    for digit in range(3):
-        total = 0
-        for value in range(2048):
-            count = counts[digit, value]
-            counts[digit, value] = total
+    counts[:] = 0
+    for i in range(start, stop):
+        slot_starts[i] = slot
+        if depth_bits[i] > 0:
+            key = np.int64(depth_bits[i]) - _NEAREST
+            entries[at] = key << 32 | i
+            counts[key & _DIGIT_MASK] += 1
+            at += 1
+            span = np.int64(rectangles[2 * i + 1])
+            slot += ((span & (SPAN_UNIT - 1)) + 1) * ((span >> 12) + 1)
+    slot_starts[stop] = slot
+
+
+@njit(**INNER)
+def count_digits(entries, start, stop, shift, counts):  # type: ignore[no-untyped-def]
+    """How often each value of the digit at bit `shift` occurs in a range."""
+    counts[:] = 0
+    for j in range(start, stop):
+        counts[(entries[j] >> shift) & _DIGIT_MASK] += 1
+
+
+@njit(**INNER)
+def places(counts, ends):  # type: ignore[no-untyped-def]
+    """Turn each strip's counts of values into the places of its first items, by value, then strip.
+
+    `ends[v + 1]` gets the end of value v's items; there may be more counts than values.
+    """
+    total = np.int64(0)
+    ends[0] = 0
+    for value in range(ends.size - 1):
+        for strip in range(counts.shape[0]):
+            count = counts[strip, value]
+            counts[strip, value] = total
             total += count
-    for j in range(m):
-        place = counts[0, keys[j] & _LOW]
-        counts[0, keys[j] & _LOW] += 1
-        swap[place], swap_keys[place] = order[j], keys[j]
-    for j in range(m):
-        digit_value = (swap_keys[j] >> _MIDDLE) & _LOW
-        place = counts[1, digit_value]
-        counts[1, digit_value] += 1
-        order[place], keys[place] = swap[j], swap_keys[j]
-    for j in range(m):
-        place = counts[2, keys[j] >> _HIGH]
-        counts[2, keys[j] >> _HIGH] += 1
-        swap[place] = order[j]
-    for j in range(m):
-        order[j] = swap[j]
-    return m
+        ends[value + 1] = total
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
-def count_pairs(tiles, n, tiles_x, tile_ends, slot_starts):  # type: ignore[no-untyped-def]
-    """Count (splat, tile) pairs; `tile_ends[t + 1]` gets the end of tile t's list, `slot_starts[i]` splat i's first slot.
+@njit(**INNER)
+def move(entries, start, stop, shift, cursors, moved):  # type: ignore[no-untyped-def]
+    """Put a range's entries to their places by one digit."""
+    for j in range(start, stop):
+        entry = entries[j]
+        value = (entry >> shift) & _DIGIT_MASK
+        place = cursors[value]
+        cursors[value] = place + 1
+        moved[place] = entry
 
-    A slot is a place in the table that `fill_pairs` writes: the slots of one splat lie side by side and tell where its
-    pairs are in the tiles' lists, so that the backward pass can sum a splat's pairs in a fixed order.
+
+@njit(**INNER)
+def count_tiles(entries, start, stop, rectangles, tiles_x, counts):  # type: ignore[no-untyped-def]
+    """How many splats of a range each tile has.
 
     Nearly all splats touch at most two by two tiles. For those, all four are counted, by 0 or 1, without a branch that
-    the processor would guess wrong every other time.
+    the processor would guess wrong every other time; beyond the last tile there is a count for the rest.
     """
-    tile_ends[:] = 0
-    slots = 0
-    for i in range(n):
-        slot_starts[i] = slots
-        dx, dy = tiles[2 * n + i] - tiles[i], tiles[3 * n + i] - tiles[n + i]
-        first = tiles[n + i] * tiles_x + tiles[i] + 1
-        if (dx | dy) & ~1 == 0:
-            tile_ends[first] += 1
-            tile_ends[first + dx] += dx
-            tile_ends[first + dy * tiles_x] += dy
-            tile_ends[first + dx + dy * tiles_x] += dx & dy
-            slots += (dx + 1) * (dy + 1)
-        elif dx >= 0:
-            for ty in range(dy + 1):
-                for tx in range(dx + 1):
-                    tile_ends[first + ty * tiles_x + tx] += 1
-            slots += (dx + 1) * (dy + 1)
-    slot_starts[n] = slots
-    for t in range(1, tile_ends.size):
-        tile_ends[t] += tile_ends[t - 1]
-    return slots
-
-
-@njit(error_model="numpy", nogil=True, cache=True)
-def fill_pairs(order, visible, tiles, n, tiles_x, tile_ends, slot_starts, pair_splats, slot_pairs):  # type: ignore[no-untyped-def]
-    """List each tile's splats by depth in `pair_splats`, and each splat's pairs in `slot_pairs`."""
-    cursor = tile_ends[:-1].copy()
-    for j in range(visible):
-        i = order[j]
-        slot = slot_starts[i]
-        dx, dy = tiles[2 * n + i] - tiles[i], tiles[3 * n + i] - tiles[n + i]
-        first = tiles[n + i] * tiles_x + tiles[i]
-        if (dx | dy) & ~1 == 0:
-            below = first + dy * tiles_x
-            pair = cursor[first]
-            cursor[first] = pair + 1
-            pair_splats[pair] = i
-            slot_pairs[slot] = pair
-            if dx:
-                pair = cursor[first + 1]
-                cursor[first + 1] = pair + 1
-                pair_splats[pair] = i
-                slot_pairs[slot + 1] = pair
-            if dy:
-                pair = cursor[below]
-                cursor[below] = pair + 1
-                pair_splats[pair] = i
-                slot_pairs[slot + dx + 1] = pair
-                if dx:
-                    pair = cursor[below + 1]
-                    cursor[below + 1] = pair + 1
-                    pair_splats[pair] = i
-                    slot_pairs[slot + 3] = pair
+    counts[:] = 0
+    spare = counts.size - 1
+    for j in range(start, stop):
+        prefetch(rectangles, 2 * (entries[min(j + _AHEAD, stop - 1)] & SPLAT))
+        i = entries[j] & SPLAT
+        first, span = np.int64(rectangles[2 * i]), np.int64(rectangles[2 * i + 1])
+        if span & _BEYOND_TWO == 0:
+            dx, dy = span & 1, span >> 12
+            counts[first] += 1
+            counts[first + 1 if dx else spare] += 1
+            counts[first + tiles_x if dy else spare] += 1
+            counts[first + tiles_x + 1 if dx & dy else spare] += 1
         else:
-            for ty in range(dy + 1):
-                for tx in range(dx + 1):
-                    tile = first + ty * tiles_x + tx
-                    pair = cursor[tile]
-                    cursor[tile] = pair + 1
-                    pair_splats[pair] = i
-                    slot_pairs[slot] = pair
+            for row in range((span >> 12) + 1):
+                for tile in range(first + row * tiles_x, first + row * tiles_x + (span & (SPAN_UNIT - 1)) + 1):
+                    counts[tile] += 1
+
+
+@njit(**INNER)
+def fill_tiles(entries, start, stop, rectangles, slot_starts, tiles_x, cursors, pairs):  # type: ignore[no-untyped-def]
+    """List a range's splats in their tiles. A pair is a slot over a splat; each of a splat's pairs has its own slot.
+
+    A splat's slots lie side by side, in the order of its tiles: the backward pass leaves its sums there.
+    """
+    spare = np.int64(cursors.size - 1)
+    for j in range(start, stop):
+        ahead = entries[min(j + _AHEAD, stop - 1)] & SPLAT
+        prefetch(rectangles, 2 * ahead)
+        prefetch(slot_starts, ahead)
+        i = entries[j] & SPLAT
+        first, span, slot = np.int64(rectangles[2 * i]), np.int64(rectangles[2 * i + 1]), np.int64(slot_starts[i])
+        if span & _BEYOND_TWO == 0:
+            dx, dy = span & 1, span >> 12
+            place = np.int64(cursors[first])
+            cursors[first] = place + 1
+            pairs[place] = slot << 32 | i
+            tile = first + 1 if dx else spare
+            place = np.int64(cursors[tile])
+            cursors[tile] = place + dx
+            pairs[place] = (slot + 1) << 32 | i
+            tile = first + tiles_x if dy else spare
+            place = np.int64(cursors[tile])
+            cursors[tile] = place + dy
+            pairs[place] = (slot + 1 + dx) << 32 | i
+            tile = first + tiles_x + 1 if dx & dy else spare
+            place = np.int64(cursors[tile])
+            cursors[tile] = place + (dx & dy)
+            pairs[place] = (slot + 3) << 32 | i
+        else:
+            for row in range((span >> 12) + 1):
+                for tile in range(first + row * tiles_x, first + row * tiles_x + (span & (SPAN_UNIT - 1)) + 1):
+                    place = np.int64(cursors[tile])
+                    cursors[tile] = place + 1
+                    pairs[place] = slot << 32 | i
                     slot += 1

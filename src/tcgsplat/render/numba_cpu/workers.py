@@ -1,12 +1,8 @@
-"""Sharing nogil kernels over threads, in ranges."""
+"""Threads that share nogil kernels; the calling thread is one of them."""
 
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-
-import numpy as np
-
-from tcgsplat.render.numba_cpu.layout import Ints
 
 
 def available_cores() -> int:
@@ -15,26 +11,38 @@ def available_cores() -> int:
 
 
 class Workers:
-    """A few threads that run nogil kernels over ranges."""
+    """A few threads; several callers may use them at the same time."""
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
-        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="splat")
+        self._helpers = ThreadPoolExecutor(threads - 1, thread_name_prefix="splat") if threads > 1 else None
+
+    def together(self, work: Callable[[int], object], threads: int | None = None) -> None:
+        """Call `work(0)` here and `work(1)`, `work(2)` ... on helpers; the first exception is raised.
+
+        A helper may come late, when all is done, or never: `work` must share itself out as threads come.
+        """
+        helpers = min(threads or self.threads, self.threads) - 1
+        futures = [self._helpers.submit(work, k + 1) for k in range(helpers)] if self._helpers else []
+        try:
+            work(0)
+        finally:
+            for future in futures:
+                if not future.cancel():
+                    future.result()
 
     def run(self, work: Callable[[int, int], object], cuts: list[int]) -> None:
         """Call `work(from, to)` for consecutive cuts, side by side; the first exception is raised."""
-        # Even a lone range runs on a worker: kernels that spill registers are faster on a thread's fresh stack.
-        futures = [self._pool.submit(work, a, b) for a, b in zip(cuts, cuts[1:], strict=False) if b > a]
-        for future in futures:
-            future.result()
+        ranges = [(a, b) for a, b in zip(cuts, cuts[1:], strict=False) if b > a]
+        left = iter(ranges)
+
+        def take(_: int) -> None:
+            for a, b in left:
+                work(a, b)
+
+        self.together(take, len(ranges))
 
     def cuts(self, count: int, unit: int = 1) -> list[int]:
         """Equal shares of `count`, at multiples of `unit`."""
         units = -(-count // unit)
         return [min(count, units * k // self.threads * unit) for k in range(self.threads)] + [count]
-
-    def weighted_cuts(self, ends: Ints) -> list[int]:
-        """Ranges of tiles with equal shares of pairs; `ends` are running totals, one more than tiles."""
-        targets = [int(ends[-1]) * k // self.threads for k in range(1, self.threads)]
-        inner = [int(np.searchsorted(ends, target)) for target in targets]
-        return [0, *(min(cut, len(ends) - 1) for cut in inner), len(ends) - 1]

@@ -1,0 +1,147 @@
+"""The passes as three kernels, each of several phases that threads share; see `phases.py`.
+
+Between `arrange` and `composite` Python makes room for as many (splat, tile) pairs as there are.
+"""
+
+import numpy as np
+from numba import njit
+
+from tcgsplat.render.numba_cpu import blending, projection, tiling
+from tcgsplat.render.numba_cpu.phases import WAITING, next_unit
+from tcgsplat.render.numba_cpu.simd import INNER, KERNEL
+
+UNIT = 1024
+"""Splats in a unit of projection and of the chain rule. Fixed, because pose sums are made unit by unit."""
+TILES = 2
+"""Tiles in a unit of compositing: side by side, so that the second finds splats of the first in the cache."""
+SPARE = 8
+"""Places after the pairs for each strip: a cache line."""
+
+# Phases of `arrange`. Each digit of the sorting keys is counted, placed and moved; LIST counts the first.
+PROJECT, LIST, DIGITS = 0, 1, 4
+COUNT_TILES = LIST + 3 * DIGITS
+PLACE_TILES = COUNT_TILES + 1
+# Phases of `composite` and of `differentiate`.
+FILL, FORWARD = 0, 1
+BACKWARD, CHAIN = 0, 1
+
+
+@njit(**INNER)
+def _before(unit_sums, unit, column):  # type: ignore[no-untyped-def]
+    total = np.int64(0)
+    for k in range(unit):
+        total += unit_sums[k, column]
+    return total
+
+
+@njit(**KERNEL)
+def arrange(
+    progress, last_phase, P, n, cam, tiles_x, records, depths, depth_bits, rectangles, unit_sums, slot_starts, entries,
+    swapped, digit_counts, digit_ends, tile_counts, tile_ends,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Project, sort by depth into `entries` and make room in the tiles' lists. False: has waited for long.
+
+    `unit_sums` gets `tiling.tally`'s numbers of each unit.
+    """
+    units, strips = unit_sums.shape[0], digit_counts.shape[0]
+    visible, digits = np.int64(0), np.int64(0)
+    for phase in range(last_phase + 1):
+        digit, step = (phase - LIST) // 3, (phase - LIST) % 3
+        shift = min(32 + tiling.DIGIT_BITS * digit, 63)  # a fourth digit is 0 for all
+        if phase == LIST:
+            visible, digits = _before(unit_sums, units, 0), tiling.used_digits(unit_sums)
+        if phase == PROJECT:
+            count = units
+        elif phase == PLACE_TILES:
+            count = 1
+        elif phase == COUNT_TILES:
+            count = strips
+        else:
+            count = 0 if digit >= digits else (1 if step == 1 else strips)
+        k = next_unit(progress, phase, count, 0)
+        while k >= 0:
+            start, stop = visible * k // strips, visible * (k + 1) // strips
+            unit, unit_after = units * k // strips, units * (k + 1) // strips
+            if phase == PROJECT:
+                start, stop = k * UNIT, min((k + 1) * UNIT, n)
+                projection.forward(P, n, start, stop, cam, tiles_x, records, depths, rectangles)
+                tiling.tally(start, stop, depth_bits, rectangles, unit_sums[k])
+            elif phase == LIST:
+                at, slot = _before(unit_sums, unit, 0), _before(unit_sums, unit, 1)
+                tiling.list_visible(
+                    unit * UNIT, min(unit_after * UNIT, n), at, slot, depth_bits, rectangles, entries, digit_counts[k],
+                    slot_starts,
+                )  # fmt: skip
+            elif phase == COUNT_TILES:
+                tiling.count_tiles(entries, start, stop, rectangles, tiles_x, tile_counts[k])
+            elif phase == PLACE_TILES:
+                tiling.places(tile_counts, tile_ends)
+                for strip in range(strips):
+                    tile_counts[strip, tile_ends.size - 1] = tile_ends[tile_ends.size - 1] + SPARE * strip
+            elif step == 1:
+                tiling.places(digit_counts, digit_ends)
+            else:
+                source, target = (swapped, entries) if digit & 1 else (entries, swapped)
+                if step == 0:
+                    tiling.count_digits(source, start, stop, shift, digit_counts[k])
+                else:
+                    if digit == 0:
+                        start, stop = _before(unit_sums, unit, 0), _before(unit_sums, unit_after, 0)
+                    tiling.move(source, start, stop, shift, digit_counts[k], target)
+            k = next_unit(progress, phase, count, 1)
+        if k == WAITING:
+            return False
+    return True
+
+
+@njit(**KERNEL)
+def composite(
+    progress, last_phase, entries, visible, rectangles, slot_starts, tiles_x, tile_counts, tile_ends, pairs, records,
+    width, height, grid, local, lists, masks, planes,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Fill the tiles' lists and draw them. False: has waited for long."""
+    strips, tiles = tile_counts.shape[0], tile_ends.size - 1
+    for phase in range(last_phase + 1):
+        count = strips if phase == FILL else -(-tiles // TILES)
+        k = next_unit(progress, phase, count, 0)
+        while k >= 0:
+            if phase == FILL:
+                tiling.fill_tiles(
+                    entries, visible * k // strips, visible * (k + 1) // strips, rectangles, slot_starts, tiles_x,
+                    tile_counts[k], pairs,
+                )  # fmt: skip
+            else:
+                blending.forward(
+                    k * TILES, min((k + 1) * TILES, tiles), tile_ends, pairs, records, tiles_x, width, height, grid,
+                    local, lists, masks, planes,
+                )  # fmt: skip
+            k = next_unit(progress, phase, count, 1)
+        if k == WAITING:
+            return False
+    return True
+
+
+@njit(**KERNEL)
+def differentiate(
+    progress, last_phase, tile_ends, pairs, records, tiles_x, width, height, grid, masks, planes, d_planes, local,
+    pair_sums, P, n, cam, slot_starts, grads, pose_sums,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """From `d_planes` to the sums of all pairs, to `grads` and to each unit's `pose_sums`. False: has waited for long."""
+    tiles = tile_ends.size - 1
+    for phase in range(last_phase + 1):
+        count = -(-tiles // TILES) if phase == BACKWARD else pose_sums.shape[0]
+        k = next_unit(progress, phase, count, 0)
+        while k >= 0:
+            if phase == BACKWARD:
+                blending.backward(
+                    k * TILES, min((k + 1) * TILES, tiles), tile_ends, pairs, records, tiles_x, width, height, grid,
+                    masks, planes, d_planes, local, pair_sums,
+                )  # fmt: skip
+            else:
+                projection.backward(
+                    P, n, k * UNIT, min((k + 1) * UNIT, n), cam, slot_starts, pair_sums, grads, pose_sums[k]
+                )
+            k = next_unit(progress, phase, count, 1)
+        if k == WAITING:
+            return False
+    return True
