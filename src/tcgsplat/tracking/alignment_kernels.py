@@ -257,7 +257,7 @@ def normal_equations(points, live, constants):
     with sigma_z(d) = sigma_floor + sigma_slope (d - 0.4)^2 metres (Nguyen et al., 3DIMPVT 2012). A point whose depth
     disagrees by more than `gate` (1 + z/2) metres is hidden or has moved, and neither of its residuals counts.
 
-    What does not count has weight 0: no lane leaves the image, and none multiplies 0 by infinity.
+    What does not count has weight 0, looks at pixel (1, 1) if it is out of view, and never multiplies 0 by infinity.
     """
     h, w = live.shape[:2]
     n, pitch = points.shape[1], CHANNELS * w
@@ -273,12 +273,13 @@ def normal_equations(points, live, constants):
     depth_precision = _ONE / (constants[DEPTH_SCALE] * constants[DEPTH_SCALE])
     balance = constants[BALANCE]
     zero, one, half, tiny, near = spread(_ZERO), spread(_ONE), spread(_HALF), spread(_TINY), spread(NEAREST)
-    # Up to the last number below w - 2, as slopes are known up to column w - 2.
-    last_u, last_v = spread(np.nextafter(np.float32(w - 2), _ZERO)), spread(np.nextafter(np.float32(h - 2), _ZERO))
-    totals, sums = np.zeros(SUMS, np.float64), np.zeros(SUMS * LANES, np.float32)
+    end_u, end_v = spread(np.float32(w - 2)), spread(np.float32(h - 2))
+    totals, sums = np.zeros(SUMS), np.empty(SUMS * LANES, np.float32)
     for start in range(0, n, _CHUNK * LANES):
-        sums[:] = _ZERO
-        for i in range(start, min(start + _CHUNK * LANES, n), LANES):
+        for entry in range(SUMS):
+            store(sums, entry * LANES, zero)
+        stop = start + _CHUNK * LANES
+        for i in range(start, stop if stop < n else n, LANES):
             px, py, pz = load(points, PX * n + i), load(points, PY * n + i), load(points, PZ * n + i)
             X, Y, Z = (
                 px * r00 + py * r01 + pz * r02 + t0,
@@ -288,11 +289,11 @@ def normal_equations(points, live, constants):
             iz = _ONE / maximum(Z, near)
             u, v = X * iz * focal_x + center_x, Y * iz * focal_y + center_y
             in_front = where_ge(pz, tiny, where_ge(Z, near, one, zero), zero)
-            in_columns = where_ge(u, one, where_ge(last_u, u, in_front, zero), zero)
-            in_view = where_ge(v, one, where_ge(last_v, v, in_columns, zero), zero)
+            in_columns = where_ge(u, end_u, zero, where_ge(u, one, in_front, zero))
+            in_view = where_ge(v, end_v, zero, where_ge(v, one, in_columns, zero))
             if mask_ge(in_view, half) == 0:
                 continue
-            u, v = maximum(minimum(u, last_u), one), maximum(minimum(v, last_v), one)
+            u, v = where_ge(in_view, half, u, one), where_ge(in_view, half, v, one)
             x0, y0 = floor(u), floor(v)
             squares = gather_squares(live, pitch, x0, y0)
             a, b = u - x0, v - y0
