@@ -24,6 +24,7 @@ from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory
+from tcgsplat.tracking.delay import DepthDelay
 from tcgsplat.tracking.motion import ConstantVelocity
 from tcgsplat.tracking.synchronization import synchronized
 from tcgsplat.tracking.tracker import Tracked, Tracker
@@ -77,7 +78,10 @@ class Slam:
         self._mapping_thread = ThreadPoolExecutor(1, thread_name_prefix="mapping")
         self._updating: Future[tuple[Submap, MapUpdate]] | None = None
         self._since_mapped = 0
+        self._synchronizes = config.tracker.synchronization != "none"
+        self._learns_delay = config.tracker.synchronization == "learnt"
         self.motion = ConstantVelocity()
+        self.delay = DepthDelay()
         self.submap = self._anchored(se3.identity(), index=0)
         self.atlas = Atlas().with_submap(self.submap.T_world_map)
         self.trajectory = Trajectory()
@@ -92,11 +96,16 @@ class Slam:
         clock.lap("wait")
 
         # Track: the map stands still, only the camera moves (equations 17 to 19).
-        together = synchronized(frame, self.motion.velocity)
+        velocity = self.motion.steady
+        applied = velocity * self.delay.seconds
+        frame = self.delay.corrected(frame) if self._learns_delay else frame
+        together = synchronized(frame, velocity) if self._synchronizes else frame
         tracked = self._tracker.track(together, self.submap, guess=self.motion.predict(frame.timestamp))
         T_map_cam = tracked.T_map_cam
         advance = self.motion.advanced if tracked.converged else self.motion.coasted
         self.motion = advance(T_map_cam, frame.timestamp)
+        if self._learns_delay and tracked.converged and tracked.color and tracked.depth:
+            self.delay = self.delay.observed(self.motion.steady.numpy(), applied.numpy(), tracked.color, tracked.depth)
         clock.lap("track")
 
         # Switch: seal the submap and anchor the next one at this camera (equation 16).
@@ -113,7 +122,8 @@ class Slam:
         if maps:
             update = self._finished_update() or update
             clock.lap("wait")
-            grown = self._mapper.grown(synchronized(frame, self.motion.velocity), T_map_cam, self.submap)
+            together = synchronized(frame, self.motion.steady) if self._synchronizes else frame
+            grown = self._mapper.grown(together, T_map_cam, self.submap)
             self.submap, self._since_mapped = grown.submap, 0
             self._updating = self._mapping_thread.submit(self._updated, grown)
             clock.lap("grow")

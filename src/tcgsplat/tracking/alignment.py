@@ -7,7 +7,7 @@ minimises the same weighted residual through the rasterizer, as the paper does.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ import torch
 
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
+from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.view import Rendering
 from tcgsplat.scene.frame import Frame
 from tcgsplat.tensors import Image, Plane, Pose
@@ -27,6 +28,10 @@ _ENOUGH_FOR_EXPOSURE = 100.0
 """Sum of weights below which gain and offset are left alone: about as many points."""
 _FLAT_VARIANCE = 0.002
 """Variance of intensity, grey levels squared, that a gain of 1 is worth: an image flatter than that keeps it."""
+_COARSEST = 80
+"""Pixels across the coarsest level, at most: a pixel there is most of a degree, what a fast hand turns in a frame."""
+_SPARSE = 200
+"""Pixels across from which on a level is sampled by `stride`: above it, neighbours say nearly the same."""
 _STEP_PRIOR = 0.05
 """Spread of a step that is expected before anything is seen, metres and radians."""
 _LOW, _HIGH = np.sort(np.indices((6, 6)), axis=0)
@@ -39,9 +44,10 @@ class AlignmentConfig:
     """Constants of the solver. [ours]: measured on six sequences (design/tracking-recipe.md)."""
 
     iterations: tuple[int, ...] = (3, 2, 3)
-    """Passes a level, finest first: full, half, quarter resolution. [ours]"""
+    """Passes a level, finest first: full, half, quarter resolution; images more than 320 pixels wide get further
+    levels with the passes of the last. [ours]"""
     stride: int = 3
-    """Every how many pixels a point is taken at full resolution; all are taken at the coarse levels. [ours]"""
+    """Every how many pixels a point is taken where a level is more than 200 pixels wide; else all are. [ours]"""
     depth_weight: float = 1.0
     """Geometry over colour, after each has been divided by its own spread. [ours]"""
     min_alpha: float = 0.7
@@ -70,6 +76,16 @@ class AlignmentConfig:
 
 
 @dataclass(frozen=True)
+class Equations:
+    """Normal equations of one kind of residual at a pose, H x = -g, for a left perturbation of map to camera."""
+
+    H: Doubles
+    """[6, 6]; translation first."""
+    g: Doubles
+    """[6]"""
+
+
+@dataclass(frozen=True)
 class Alignment:
     """What the solver found."""
 
@@ -81,6 +97,10 @@ class Alignment:
     """Share of the overlap's depth readings that agree within the gate; 1 where there is none to ask."""
     correlation: float
     """Of live and rendered intensity where the depth does not disagree, in [-1, 1]; does not feel the exposure."""
+    color: Equations
+    """What colour alone asks for at the pose that was found."""
+    depth: Equations
+    """What depth alone asks for there."""
 
 
 def luma(color: Image) -> Floats:
@@ -103,6 +123,12 @@ class _Level:
     """Metres, times (1 + z/2)."""
 
 
+def _passes(config: AlignmentConfig, camera: Camera) -> tuple[int, ...]:
+    """Passes a level, finest first; large images get more coarse levels, so that a step spans as much of any image."""
+    more = max(math.ceil(math.log2(camera.width / _COARSEST)) + 1 - len(config.iterations), 0)
+    return (*config.iterations, *[config.iterations[-1]] * more)
+
+
 def _levels(frame: Frame, rendering: Rendering, weight: Plane, config: AlignmentConfig) -> list[_Level]:
     """The levels that have passes, finest first."""
     intensity, depth = kernels.rendered_view(
@@ -112,14 +138,15 @@ def _levels(frame: Frame, rendering: Rendering, weight: Plane, config: Alignment
     weights = np.ascontiguousarray(weight.numpy())
     live, live_depth = kernels.live_view(frame.color.numpy(), frame.depth.numpy(), frame.valid.numpy())
     camera, levels = frame.camera, []
-    for number, passes in enumerate(config.iterations):
+    for number, passes in enumerate(_passes(config, camera)):
         if number:
             intensity, weights, live = (kernels.halved_intensity(image) for image in (intensity, weights, live))
             depth, live_depth = kernels.halved_depth(depth), kernels.halved_depth(live_depth)
             camera = camera.scaled(0.5)
         if passes:
             intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-            stride, radius, gate = (1, 1, 2 * config.gate) if number else (config.stride, 2, config.gate)
+            stride, radius = (config.stride, 2) if camera.width > _SPARSE else (1, 1)
+            gate = 2 * config.gate if number else config.gate
             points = kernels.reference_points(intensity, depth, weights, intrinsics, radius, stride)
             levels.append(_Level(passes, points, kernels.live_image(live, live_depth), intrinsics, gate))
     return levels
@@ -173,6 +200,19 @@ def _constants(level: _Level, T: Doubles, photometry: _Photometry, config: Align
     return constants
 
 
+def _separated(level: _Level, T: Doubles, photometry: _Photometry, config: AlignmentConfig) -> list[Equations]:
+    """Normal equations of colour alone and of depth alone."""
+    color, both = (
+        kernels.normal_equations(
+            level.points, level.live, _constants(level, T, photometry, replace(config, depth_weight=weight))
+        )
+        for weight in (0.0, 1.0)
+    )
+    return [
+        Equations(sums[_HESSIAN_ENTRY], sums[kernels.GRADIENT : kernels.GRADIENT + 6]) for sums in (color, both - color)
+    ]
+
+
 def _step(sums: Doubles) -> Doubles:
     """The Gauss-Newton step, damped as if a step of 0 +- 5 cm and +- 0.05 radians had been measured.
 
@@ -220,6 +260,7 @@ def align(frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, co
             if np.linalg.norm(step[:3]) < 3e-4 and np.linalg.norm(step[3:]) < 3e-4 and level is not finest:
                 break
     readings = float(sums[kernels.READINGS])
+    color, depth = _separated(finest, T, photometry, config)
     return Alignment(
         T_map_cam=T_map_ref @ se3.inverse(torch.from_numpy(T)),
         iterations=passes,
@@ -229,4 +270,6 @@ def align(frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, co
             *(float(sums[k]) for k in (kernels.GAIN_W, kernels.GAIN_R, kernels.GAIN_L)),
             *(float(sums[k]) for k in (kernels.GAIN_RR, kernels.GAIN_RL, kernels.GAIN_LL)),
         ),
+        color=color,
+        depth=depth,
     )

@@ -19,7 +19,7 @@ from tcgsplat.render.view import Rendering, render_view
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.alignment import AlignmentConfig, align, correlation, luma
+from tcgsplat.tracking.alignment import AlignmentConfig, Equations, align, correlation, luma
 from tcgsplat.tracking.descent import DescentConfig, descend
 
 
@@ -29,6 +29,9 @@ class TrackerConfig:
 
     solver: Literal["alignment", "descent"] = "alignment"
     """`alignment`: Gauss-Newton against one render; `descent`: the paper's Adam through the rasterizer. [ours]"""
+    synchronization: Literal["none", "stamps", "learnt"] = "learnt"
+    """What is done about the time between colour and depth: nothing; the depth image is moved to the instant of the
+    colour image by the camera's velocity; so, and what the time stamps conceal is learnt from the motion. [ours]"""
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
     max_step: float = 0.3
@@ -47,6 +50,8 @@ class TrackerConfig:
     def __post_init__(self) -> None:
         if self.solver not in ("alignment", "descent"):
             raise ConfigError(f"tracker.solver is {self.solver!r}; choose alignment or descent")
+        if self.synchronization not in ("none", "stamps", "learnt"):
+            raise ConfigError(f"tracker.synchronization is {self.synchronization!r}; choose none, stamps or learnt")
         for name in ("max_step", "max_turn"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"tracker.{name} is {getattr(self, name)!r}; it must be above 0")
@@ -68,6 +73,10 @@ class Tracked:
     """Share of the depth readings there that agree with the map."""
     correlation: float = 1.0
     """Between the colours of the picture and of the map, in [-1, 1]."""
+    color: Equations | None = None
+    """What colour alone asks for at this pose, from solvers that know."""
+    depth: Equations | None = None
+    """What depth alone asks for there."""
 
     @property
     def converged(self) -> bool:
@@ -118,7 +127,9 @@ class Tracker:
             weight = eq.tracking_weight(rendering.confidence, floor=self._floor)
         aligned = align(frame, rendering, weight, guess, self._config.alignment)
         compared = (aligned.overlap, aligned.agreement, aligned.correlation)
-        return self._believed(guess, Tracked(aligned.T_map_cam, "", aligned.iterations, *compared))
+        return self._believed(
+            guess, Tracked(aligned.T_map_cam, "", aligned.iterations, *compared, aligned.color, aligned.depth)
+        )
 
     def _believed(self, guess: Pose, found: Tracked) -> Tracked:
         """The solver's answer, or the guess and the reason why not."""
