@@ -27,7 +27,8 @@ def submap() -> Submap:
     """Two keyframes of the room, the second one partly unseen, and Gaussians of all ages."""
     generator = torch.Generator().manual_seed(3)
     mapper = Mapper(MapperConfig(first_iterations=3), CONFIDENCE, RASTERIZER, IdSource(), generator)
-    first = mapper.optimized(mapper.grown(Room().frame(), se3.identity(), Submap.anchored(se3.identity(), index=0))).submap
+    start = Submap.anchored(se3.identity(), index=0)
+    first = mapper.optimized(mapper.grown(Room().frame(), se3.identity(), start)).submap
     T_side = pose(0.05, 0.02, 0.0, degrees=(0, 12, 0))
     side = Room().frame(T_side)
     valid = side.valid.clone()

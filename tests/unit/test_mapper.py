@@ -59,7 +59,8 @@ def mapped(
     generator = torch.Generator().manual_seed(random_seed)
     mapper = Mapper(config, confidence, rasterizer, IdSource(first_id), generator)
     start = Submap.anchored(se3.identity(), index=0) if submap is None else submap
-    return mapper.optimized(mapper.grown(frame or Room().frame(), se3.identity() if T_map_cam is None else T_map_cam, start))
+    T_map_cam = se3.identity() if T_map_cam is None else T_map_cam
+    return mapper.optimized(mapper.grown(frame or Room().frame(), T_map_cam, start))
 
 
 @pytest.fixture(scope="module")

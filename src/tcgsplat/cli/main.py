@@ -19,6 +19,7 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
     {
         "run": "map a recorded RGB-D folder: Gaussian map, trajectory and confidence",
         "demo": "make a synthetic apartment, map it, and show how well that went",
+        "refine": "optimise the map of a finished run further, for better pictures",
         "eval": "score a run: report.json, contact sheet, trajectory plot",
         "export": "write a run's map as one PLY file and its trajectory as text",
         "synth": "write the synthetic apartment as an RGB-D folder",

@@ -66,7 +66,7 @@ class NativeOptimization:
         self._excess: Floats = np.zeros(self._padded, np.float32)
         self._rates = _rates(config)
 
-    def step(self, view: int, frozen: tuple[str, ...] = ()) -> None:
+    def step(self, view: int, frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
         """See `Optimization`."""
         assert not frozen  # `covers` keeps such settings away
         target = self._view(view)
@@ -74,7 +74,7 @@ class NativeOptimization:
         d_planes = self._differentiated_losses(target, drawn.planes)
         grads, _ = self._passes.differentiate(drawn, d_planes)
         visible = drawn.visible.astype(np.float32)
-        constants = self._constants(visible)
+        constants = self._constants(visible, pace)
         self._passes._workers.run(
             lambda a, b: kernels.adam_step(
                 self._padded, a, b, _flat(self._raw), _flat(self._parameters), _flat(self._before), _flat(self._first),
@@ -177,12 +177,12 @@ class NativeOptimization:
             p_min=config.p_min,
         )
 
-    def _constants(self, visible: Floats) -> Floats:
+    def _constants(self, visible: Floats, pace: float) -> Floats:
         config = self._confidence
         counted = max(float(visible @ self._counted), 1.0) if config.stability_reduction == "mean" else 1.0
         self._stability_weight = config.stability_weight / counted
         weights = [config.scale_change_weight, config.rotation_change_weight, self._stability_weight]
-        return np.concatenate((self._rates, np.array(weights, np.float32)))
+        return np.concatenate((np.float32(pace) * self._rates, np.array(weights, np.float32)))
 
 
 def _flat(matrix: Floats) -> Floats:

@@ -27,10 +27,10 @@ from tcgsplat.tensors import PerGaussian, PerGaussianFlag
 class Optimization(Protocol):
     """A submap while it is optimised: mutable, made for one mapping update, dropped after it."""
 
-    def step(self, view: int, frozen: tuple[str, ...] = ()) -> None:
+    def step(self, view: int, frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
         """Follow the gradient of Eq. 21 at one keyframe by one Adam step of every Gaussian in view.
 
-        Parameters named in `frozen` stay.
+        Parameters named in `frozen` stay; `pace` multiplies the learning rates.
         """
         ...
 
@@ -71,7 +71,7 @@ class AutogradOptimization:
         self._T_cam_map = [se3.inverse(keyframe.T_map_cam) for keyframe in submap.keyframes]
         self._loss_value = torch.zeros(())
 
-    def step(self, view: int, frozen: tuple[str, ...] = ()) -> None:
+    def step(self, view: int, frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
         """See `Optimization`."""
         frame, gaussians = self._submap.keyframes[view].frame, self._adam.gaussians
         rendering = render(
@@ -83,6 +83,7 @@ class AutogradOptimization:
             loss,
             visible=rendering.visible,
             frozen=frozen,
+            pace=pace,
             gradient_scale=scale if literal else None,
             step_scale=None if literal else scale,
         )

@@ -63,6 +63,7 @@ class RowAdam:
         loss: Tensor,
         visible: PerGaussianFlag | None = None,
         frozen: tuple[str, ...] = (),
+        pace: float = 1.0,
         gradient_scale: PerGaussian | None = None,
         step_scale: PerGaussian | None = None,
     ) -> None:
@@ -73,6 +74,7 @@ class RowAdam:
             visible: Rows that take part; the others stay, and so do their moments and their count of steps. None
                 for all.
             frozen: Names of parameters that stay.
+            pace: Factor on all learning rates.
             gradient_scale: Eq. 24 to the letter: multiplies the geometry's gradients.
             step_scale: Eq. 24 as it is meant: multiplies the geometry's steps.
         """
@@ -100,7 +102,7 @@ class RowAdam:
                     step *= step_scale[rows, None]
                 if name == "sh":
                     step[:, 1:] *= 0.05
-                self._parameters[name][rows] -= getattr(self._rates, name) * step
+                self._parameters[name][rows] -= pace * getattr(self._rates, name) * step
 
     def kept(self, keep: PerGaussianFlag) -> "RowAdam":
         """The optimiser of the flagged rows only, moments included."""

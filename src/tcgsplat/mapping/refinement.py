@@ -1,0 +1,63 @@
+"""Making a finished submap prettier: the losses of mapping, over all of its keyframes, for as long as one likes."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+
+from tcgsplat.confidence.state import ConfidenceConfig
+from tcgsplat.mapping.optimization import begin
+from tcgsplat.mapping.settings import MapperConfig
+from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.scene.submap import Submap
+
+LAST_PACE = 0.05
+"""Learning rates at the end, of those at the beginning: they fall evenly in the logarithm, so that what was found
+roughly settles finely."""
+
+
+def refined(
+    submap: Submap,
+    config: MapperConfig,
+    confidence: ConfidenceConfig,
+    rasterizer: Rasterizer,
+    generator: torch.Generator,
+    progress: Callable[[int], float],
+) -> Submap:
+    """A submap optimised further over its keyframes, each seen once before any is seen again.
+
+    Confidence weighs pixels and steps as it does online (equations 20 and 24) and stays what it was. The stability loss
+    is left out: it holds a Gaussian to where it was before one mapping update, and this is no such update.
+
+    Args:
+        submap: With its keyframes.
+        config: Losses and learning rates.
+        confidence: Guidance.
+        rasterizer: Backend.
+        generator: Order of the keyframes.
+        progress: Given the steps taken so far, the share of the work that is done; the work ends at 1. A share of
+            steps makes the result repeatable, one of time does not.
+    """
+    if len(submap) == 0 or not submap.keyframes:
+        return submap
+    optimization = begin(submap, config, replace(confidence, stability_weight=0.0), rasterizer)
+    order: list[int] = []
+    steps = 0
+    while (done := progress(steps)) < 1:
+        order = order or torch.randperm(len(submap.keyframes), generator=generator).tolist()
+        optimization.step(order.pop(), pace=LAST_PACE**done)
+        steps += 1
+    optimization.prune()
+    return optimization.submap()
+
+
+def for_seconds(seconds: float) -> Callable[[int], float]:
+    """Progress by the clock, which begins now."""
+    started = time.perf_counter()
+    return lambda _: (time.perf_counter() - started) / max(seconds, 1e-9)
+
+
+def for_steps(count: int) -> Callable[[int], float]:
+    """Progress by a number of steps."""
+    return lambda steps: steps / max(count, 1)
