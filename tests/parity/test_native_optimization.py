@@ -7,6 +7,7 @@ import pytest
 import torch
 from analytic_room import Room, pose
 
+from tcgsplat.confidence import equations as eq
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.mapper import Mapper
@@ -91,6 +92,25 @@ def test_takes_the_steps_of_autograd(submap: Submap, guidance: str, depth_mode: 
         assert float(((a - b).abs() < 0.02 * step).float().mean()) > 0.98
 
 
+def test_the_self_distance_is_between_rows_of_the_same_id(submap: Submap) -> None:
+    """Of the Gaussians before, some were pruned on the way: nobody may inherit another's history."""
+    for optimization in both(submap, MapperConfig(min_opacity=0.952), CONFIDENCE):
+        for view in (0, 1):
+            optimization.step(view)
+            optimization.prune()
+        after = optimization.submap().gaussians
+        before = submap.gaussians.kept(torch.isin(submap.gaussians.ids, after.ids))
+        assert len(after) < len(submap)
+        expected = eq.self_distance(
+            eq.mean_change(after.means, before.means),
+            eq.scale_change(after.log_scales, before.log_scales),
+            eq.rotation_change(after.quats, before.quats),
+            scale_weight=CONFIDENCE.scale_change_weight,
+            rotation_weight=CONFIDENCE.rotation_change_weight,
+        )
+        torch.testing.assert_close(optimization.self_distance(), expected, atol=2e-6, rtol=1e-4)  # rounding of Eq. 7
+
+
 def test_the_same_bits_whatever_the_number_of_threads(submap: Submap) -> None:
     results = []
     for threads in (1, 2, 3):
@@ -128,3 +148,20 @@ def test_settings_that_only_autograd_knows_are_left_to_it() -> None:
     assert not covers(MapperConfig(isotropy_weight=1.0), CONFIDENCE)
     assert not covers(MapperConfig(frozen_color_share=0.5), CONFIDENCE)
     assert not covers(MapperConfig(), replace(CONFIDENCE, step_scale_mode="gradient"))
+
+
+def test_a_width_that_is_no_multiple_of_sixteen(submap: Submap) -> None:
+    border = 3
+
+    def cropped(keyframe: Keyframe) -> Keyframe:
+        frame, inner = keyframe.frame, slice(border, -border)
+        images = {name: getattr(frame, name)[inner, inner] for name in ("color", "depth", "valid")}
+        return replace(keyframe, frame=replace(frame, camera=frame.camera.cropped(border), **images))
+
+    odd = replace(submap, keyframes=tuple(cropped(keyframe) for keyframe in submap.keyframes))
+    losses = []
+    for optimization in both(odd, MapperConfig(), CONFIDENCE):
+        for view in (1, 0):
+            optimization.step(view)
+            losses.append(optimization.loss)
+    assert losses[2:] == pytest.approx(losses[:2], rel=2e-5)

@@ -7,7 +7,6 @@ import torch
 from analytic_room import CAMERA, Room, pose
 from torch import Tensor
 
-from tcgsplat.confidence import equations as eq
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.feedback import judged, observation
@@ -15,7 +14,6 @@ from tcgsplat.mapping.mapper import Mapped
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import render_view
 from tcgsplat.scene.frame import Frame
-from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.tensors import Pose
 
@@ -23,14 +21,13 @@ CONFIG = ConfidenceConfig(color_residual_weight=1.0, depth_residual_weight=2.0, 
 T_HERE = pose(0.02, 0.01, -0.03, degrees=(1, 4, -2))
 
 
-def update(
-    submap: Submap, frame: Frame, rasterizer: Rasterizer, *, before: Gaussians | None = None, T_map_cam: Pose = T_HERE
-) -> Mapped:
+def update(submap: Submap, frame: Frame, rasterizer: Rasterizer, *, T_map_cam: Pose = T_HERE) -> Mapped:
     """A mapping update of a submap that has since had one, and that left the Gaussians as they are."""
     mapped = replace(submap, keyframes=(*submap.keyframes, Keyframe(frame, T_map_cam)))
     return Mapped(
-        before=submap.gaussians if before is None else before,
+        before=submap.gaussians,
         submap=mapped,
+        distance=torch.zeros(len(submap)),
         rendering=render_view(mapped, frame.camera, T_map_cam, rasterizer),
         loss=0.0,
     )
@@ -111,35 +108,6 @@ def test_no_reading_adds_no_depth_residual(corner: Submap, rasterizer: Rasterize
     seen, unmeasured = (observation(update(corner, f, rasterizer), f, CONFIG, "planar") for f in (frame, blind))
     assert (unmeasured.residual <= seen.residual).all()
     assert torch.equal(unmeasured.valid, seen.valid)
-
-
-def test_distance_is_between_rows_of_the_same_id(corner: Submap, rasterizer: Rasterizer) -> None:
-    """Of the Gaussians before, some were pruned on the way: nobody may inherit another's history."""
-    frame = Room().frame(T_HERE)
-    survivors = corner.kept(torch.arange(len(corner)) % 5 != 2)
-    moved = survivors.gaussians.ids.float() * 1e-6  # each by a way of its own
-    after = replace(
-        survivors.gaussians, means=survivors.gaussians.means + moved[:, None] * torch.tensor([0.6, 0.0, 0.8])
-    )
-    mapped = update(replace(survivors, gaussians=after), frame, rasterizer, before=corner.gaussians)
-    distance = observation(mapped, frame, CONFIG, "planar").distance
-    torch.testing.assert_close(distance, moved, atol=2e-6, rtol=0)
-
-
-def test_distance_counts_shape_and_turning(corner: Submap, rasterizer: Rasterizer) -> None:
-    frame = Room().frame(T_HERE)
-    config = replace(CONFIG, scale_change_weight=0.5, rotation_change_weight=2.0)
-    old = corner.gaussians
-    turned = replace(old, quats=old.quats + 0.05, log_scales=old.log_scales + 0.1)
-    mapped = update(replace(corner, gaussians=turned), frame, rasterizer, before=old)
-    expected = eq.self_distance(
-        torch.zeros(len(old)),
-        eq.scale_change(turned.log_scales, old.log_scales),
-        eq.rotation_change(turned.quats, old.quats),
-        scale_weight=0.5,
-        rotation_weight=2.0,
-    )
-    torch.testing.assert_close(observation(mapped, frame, config, "planar").distance, expected)
 
 
 def test_judging_ticks_the_clock_and_touches_confidence_alone(corner: Submap, rasterizer: Rasterizer) -> None:

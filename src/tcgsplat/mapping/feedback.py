@@ -8,7 +8,6 @@ from tcgsplat.confidence import equations as eq
 from tcgsplat.confidence.state import ConfidenceConfig, Observation
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.mapper import Mapped
-from tcgsplat.mapping.optimization import self_distance
 from tcgsplat.render.losses import color_error, depth_error
 from tcgsplat.render.view import DepthMode
 from tcgsplat.scene.frame import Frame
@@ -17,17 +16,9 @@ from tcgsplat.scene.submap import Submap
 
 @torch.no_grad()
 def observation(mapped: Mapped, frame: Frame, config: ConfidenceConfig, depth_mode: DepthMode) -> Observation:
-    """Self-distance and residual of every surviving Gaussian; valid where it was there before and is in view.
-
-    Rows before and after are joined by id, so pruning between them cannot shift one Gaussian's history to another.
-    """
+    """Self-distance and residual of every surviving Gaussian; valid where it was there before and is in view."""
     submap, rendering = mapped.submap, mapped.rendering
-    after = submap.gaussians
-    before = mapped.before
-    if mapped.pruned:
-        before = before.picked(torch.searchsorted(before.ids, after.ids))  # ids only ever grow along the rows
-
-    points = se3.transform(se3.inverse(submap.keyframes[-1].T_map_cam), after.means)
+    points = se3.transform(se3.inverse(submap.keyframes[-1].T_map_cam), submap.gaussians.means)
     pixels = frame.camera.project(torch.cat((points[:, :2], points[:, 2:].clamp_min(1e-6)), dim=1))
     limit = torch.tensor([frame.camera.width - 0.5, frame.camera.height - 0.5], device=pixels.device)
     inside = ((pixels > -0.5) & (pixels < limit)).all(dim=1)
@@ -42,7 +33,7 @@ def observation(mapped: Mapped, frame: Frame, config: ConfidenceConfig, depth_mo
     sees_the_world = eq.sample_at(frame.valid.float(), pixels) > 0.5
     return Observation(
         valid=rendering.visible & inside & sees_the_world & (submap.confidence.born < submap.clock),
-        distance=self_distance(after, before, config),
+        distance=mapped.distance,
         residual=eq.sample_at(residual, pixels),
     )
 

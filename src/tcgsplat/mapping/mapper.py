@@ -6,7 +6,7 @@ import torch
 
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.mapping.keyframes import thinned
-from tcgsplat.mapping.optimization import begin
+from tcgsplat.mapping.optimization import Optimization, begin
 from tcgsplat.mapping.seeding import IdSource, seed
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.protocol import Rasterizer
@@ -14,7 +14,7 @@ from tcgsplat.render.view import Rendering, render_view
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
-from tcgsplat.tensors import Pose
+from tcgsplat.tensors import PerGaussian, Pose
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,8 @@ class Mapped:
     """The Gaussians after seeding, before the first step."""
     submap: Submap
     """Optimised and pruned; confidence not yet judged."""
+    distance: PerGaussian
+    """How far each Gaussian of the submap has moved in this update (Eq. 8), metres."""
     rendering: Rendering
     """The newest keyframe's view of the optimised submap."""
     loss: float
@@ -81,12 +83,13 @@ class Mapper:
     def optimized(self, grown: Grown) -> Mapped:
         """The grown submap, optimised over its keyframes."""
         iterations = self._config.first_iterations if grown.first else self._config.iterations
-        submap, loss = self._optimized(grown.submap, iterations)
+        optimization = self._optimized(grown.submap, iterations)
+        submap = optimization.submap()
         newest = submap.keyframes[-1]
         rendering = render_view(submap, newest.frame.camera, newest.T_map_cam, self._rasterizer)
-        return Mapped(grown.submap.gaussians, submap, rendering, loss)
+        return Mapped(grown.submap.gaussians, submap, optimization.self_distance(), rendering, optimization.loss)
 
-    def _optimized(self, submap: Submap, iterations: int) -> tuple[Submap, float]:
+    def _optimized(self, submap: Submap, iterations: int) -> Optimization:
         """Adam over drawn keyframes; faint Gaussians are dropped halfway and at the end."""
         optimization = begin(submap, self._config, self._confidence, self._rasterizer)
         for iteration in range(iterations):
@@ -95,7 +98,7 @@ class Mapper:
             frozen = ("sh",) if iteration < self._config.frozen_color_share * iterations else ()
             optimization.step(self._drawn_view(len(submap.keyframes)), frozen)
         optimization.prune()
-        return optimization.submap(), optimization.loss
+        return optimization
 
     def _drawn_view(self, count: int) -> int:
         """The newest keyframe with probability `current_share`, else any older one."""

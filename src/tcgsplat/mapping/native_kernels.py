@@ -1,4 +1,4 @@
-"""One step of mapping without autograd: the pixel losses and their derivative, and Adam on rows of Gaussians.
+"""Adam on rows of Gaussians, without autograd; the losses are in `loss_kernels.py`.
 
 Parameters are rows of one float32 matrix [ROWS, n padded to 16], in the order of the rasterizer's own matrix; what
 `optimizer.RowAdam` and `optimization.AutogradOptimization` say in torch is said here sixteen Gaussians at a time.
@@ -11,12 +11,15 @@ from numba import njit
 
 from tcgsplat.mapping.optimizer import BETA_1, BETA_2, EPSILON
 from tcgsplat.render.numba_cpu.layout import FEATURE, LOG2_OPACITY, MEAN, QUAT, SCALE
+from tcgsplat.render.numba_cpu.phases import WAITING, next_unit
 from tcgsplat.render.numba_cpu.simd import (
-    MATH,
+    INNER,
+    KERNEL,
     exp2,
     fma,
     load,
     log2,
+    mask_ge,
     maximum,
     minimum,
     spread,
@@ -31,11 +34,12 @@ from tcgsplat.scene.gaussians import SH_C0
 LOG_SCALE, LOGIT, SH = SCALE, LOG2_OPACITY, FEATURE
 ROWS = SH + 3
 
-# Constants of `pixel_losses`.
-COLOR_WEIGHT, DEPTH_WEIGHT, GUIDED, DEPTH_CHANNEL, DIVIDED = range(5)
 # Constants of `adam_step`, after the learning rate of every row.
 SCALE_WEIGHT, ROTATION_WEIGHT, STABILITY_WEIGHT = ROWS, ROWS + 1, ROWS + 2
 CONSTANTS = ROWS + 3
+
+UNIT = 2048
+"""Gaussians that a thread takes at a time."""
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _LOG2E = np.float32(1 / math.log(2))
@@ -48,58 +52,9 @@ _HUGE = np.float32(1e30)
 _BETA_1, _BETA_2, _EPSILON = np.float32(BETA_1), np.float32(BETA_2), np.float32(EPSILON)
 _REST_1, _REST_2 = np.float32(1 - BETA_1), np.float32(1 - BETA_2)
 _TINY = np.float32(1e-24)
-_MIN_ALPHA = np.float32(1e-3)
-"""As `Rendering.depth_as` has it."""
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
-def seen_by_both(first, last, planes, color, valid, out):  # type: ignore[no-untyped-def]
-    """Rendered colour of a range of rows; where the picture saw nothing, the picture's own."""
-    for c in range(3):
-        for y in range(first, last):
-            for x in range(out.shape[2]):
-                out[c, y, x] = planes[c, y, x] if valid[y, x] > 0 else color[c, y, x]
-
-
-@njit(fastmath={"contract", "nsz", "arcp"}, error_model="numpy", nogil=True, cache=True)
-def pixel_losses(first, last, planes, color, depth, valid, constants, d_planes, sums):  # type: ignore[no-untyped-def]
-    """Colour and depth terms of Eq. 21 for a range of rows: the derivative by the planes, and the loss of each row.
-
-    `d_planes` comes with the derivative of the SSIM term in its first three planes; all seven are complete
-    afterwards. A pixel without a reading counts for neither term.
-    """
-    width = planes.shape[2]
-    third = _ONE / np.float32(3)
-    channel = int(constants[DEPTH_CHANNEL])
-    for y in range(first, last):
-        total = np.float32(0)
-        for x in range(width):
-            alpha, reading, seen = planes[6, y, x], depth[y, x], valid[y, x]
-            inside = seen if reading > 0 else _ZERO
-            weight = inside * (_ONE + constants[GUIDED] * (_ONE - planes[3, y, x]))
-            by_color = weight * constants[COLOR_WEIGHT] * third
-            error = _ZERO
-            for c in range(3):
-                difference = planes[c, y, x] - color[c, y, x]
-                error += abs(difference)
-                sign = _ONE if difference > 0 else (-_ONE if difference < 0 else _ZERO)
-                d_planes[c, y, x] = seen * d_planes[c, y, x] + by_color * sign
-            divisor = max(alpha, _MIN_ALPHA) if constants[DIVIDED] > 0 else _ONE
-            inverse = _ONE / divisor
-            shown = planes[channel, y, x] * inverse
-            difference = shown - reading
-            sign = _ONE if difference > 0 else (-_ONE if difference < 0 else _ZERO)
-            by_depth = weight * constants[DEPTH_WEIGHT] * sign * inverse
-            total += by_color * error + weight * constants[DEPTH_WEIGHT] * abs(difference)
-            d_planes[3, y, x] = _ZERO
-            d_planes[4, y, x] = by_depth if channel == 4 else _ZERO
-            d_planes[5, y, x] = by_depth if channel == 5 else _ZERO
-            thick = constants[DIVIDED] > 0 and alpha > _MIN_ALPHA
-            d_planes[6, y, x] = -by_depth * shown if thick else _ZERO
-        sums[y] = total
-
-
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
+@njit(**KERNEL)
 def activate(raw, P, n, start, stop):
     """The rasterizer's parameters from raw ones, for a range: what `Gaussians` calls scales, opacities and colors."""
     for i in range(start, stop, 16):
@@ -114,8 +69,40 @@ def activate(raw, P, n, start, stop):
             store(P, row * n + i, maximum(fma(load(raw, row * n + i), spread(_C0), spread(_HALF)), spread(_ZERO)))
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
-def adam_step(n, start, stop, raw, P, before, first, second, clocks, grads, visible, allowed, scale, constants, excess):
+@njit(**INNER)
+def _changes(raw, before, n, i):
+    """Of sixteen Gaussians: d_mu (Eq. 5), d_s (Eq. 6), the cosine between quaternions, and their inverse lengths."""
+    one, moved, stretched = spread(_ONE), spread(_ZERO), spread(_ZERO)
+    for k in range(3):
+        d = load(raw, (MEAN + k) * n + i) - load(before, (MEAN + k) * n + i)
+        moved = fma(d, d, moved)
+        d = load(raw, (LOG_SCALE + k) * n + i) - load(before, (LOG_SCALE + k) * n + i)
+        stretched = fma(d, d, stretched)
+    product, length, length_before = spread(_ZERO), spread(_TINY), spread(_TINY)
+    for k in range(4):
+        q, q0 = load(raw, (QUAT + k) * n + i), load(before, (QUAT + k) * n + i)
+        product, length, length_before = fma(q, q0, product), fma(q, q, length), fma(q0, q0, length_before)
+    inverse, inverse_before = one / sqrt(length), one / sqrt(length_before)
+    return sqrt(moved), sqrt(stretched), product * inverse * inverse_before, inverse, inverse_before
+
+
+@njit(**INNER)
+def _distance(moved, stretched, cosine, constants):
+    """Eq. 8."""
+    turned = maximum(spread(_ONE) - cosine * cosine, spread(_ZERO))
+    return fma(turned, spread(constants[ROTATION_WEIGHT]), fma(stretched, spread(constants[SCALE_WEIGHT]), moved))
+
+
+@njit(**KERNEL)
+def self_distances(raw, before, n, constants, out):
+    """How far each Gaussian is from where it was before the update (Eq. 8), metres."""
+    for i in range(0, n, 16):
+        moved, stretched, cosine, _, _ = _changes(raw, before, n, i)
+        store(out, i, _distance(moved, stretched, cosine, constants))
+
+
+@njit(**INNER)
+def _adam_step(n, start, stop, raw, P, before, first, second, clocks, grads, visible, allowed, scale, constants, excess):
     """One Adam step of the visible Gaussians of a range, on the losses of the pixels and of Eq. 23.
 
     `grads` holds the derivatives by `P`; they are led on to the raw parameters. `clocks` are two rows: what is left of
@@ -127,6 +114,9 @@ def adam_step(n, start, stop, raw, P, before, first, second, clocks, grads, visi
     zero, one = spread(_ZERO), spread(_ONE)
     for i in range(start, stop, 16):
         seen = load(visible, i)
+        if mask_ge(seen, one) == 0:
+            store(excess, i, zero)
+            continue
         power_1, power_2 = load(clocks, i) * _BETA_1, load(clocks, n + i) * _BETA_2
         store(clocks, i, where_ge(seen, one, power_1, load(clocks, i)))
         store(clocks, n + i, where_ge(seen, one, power_2, load(clocks, n + i)))
@@ -134,21 +124,8 @@ def adam_step(n, start, stop, raw, P, before, first, second, clocks, grads, visi
         geometry = load(scale, i)
 
         # Eq. 8 between now and before the update, and where it exceeds what is allowed, its derivative.
-        moved, stretched = zero, zero
-        for k in range(3):
-            d = load(raw, (MEAN + k) * n + i) - load(before, (MEAN + k) * n + i)
-            moved = fma(d, d, moved)
-            d = load(raw, (LOG_SCALE + k) * n + i) - load(before, (LOG_SCALE + k) * n + i)
-            stretched = fma(d, d, stretched)
-        moved, stretched = sqrt(moved), sqrt(stretched)
-        product, length, length_before = zero, spread(_TINY), spread(_TINY)
-        for k in range(4):
-            q, q0 = load(raw, (QUAT + k) * n + i), load(before, (QUAT + k) * n + i)
-            product, length, length_before = fma(q, q0, product), fma(q, q, length), fma(q0, q0, length_before)
-        inverse, inverse_before = one / sqrt(length), one / sqrt(length_before)
-        cosine = product * inverse * inverse_before
-        turned = maximum(one - cosine * cosine, zero)
-        distance = fma(turned, spread(constants[ROTATION_WEIGHT]), fma(stretched, spread(constants[SCALE_WEIGHT]), moved))
+        moved, stretched, cosine, inverse, inverse_before = _changes(raw, before, n, i)
+        distance = _distance(moved, stretched, cosine, constants)
         limit = load(allowed, i)
         store(excess, i, where_ge(limit, distance, zero, distance - limit) * seen)
         pull = where_ge(limit, distance, zero, spread(constants[STABILITY_WEIGHT]))
@@ -179,4 +156,47 @@ def adam_step(n, start, stop, raw, P, before, first, second, clocks, grads, visi
             store(first, at, where_ge(seen, one, m, load(first, at)))
             store(second, at, where_ge(seen, one, v, load(second, at)))
             store(raw, at, where_ge(seen, one, value - step, value))
-    activate(raw, P, n, start, stop)
+        activate(raw, P, n, i, i + 16)
+
+
+@njit(**KERNEL)
+def adam_step(
+    progress, n, raw, P, before, first, second, clocks, grads, visible, allowed, scale, constants, excess
+):
+    """`_adam_step` for all Gaussians, shared by threads in units. False: has waited for long."""
+    units = -(-n // UNIT)
+    k = next_unit(progress, 0, units, 0)
+    while k >= 0:
+        _adam_step(
+            n, k * UNIT, min((k + 1) * UNIT, n), raw, P, before, first, second, clocks, grads, visible, allowed, scale,
+            constants, excess,
+        )
+        k = next_unit(progress, 0, units, 1)
+    return k != WAITING
+
+
+@njit(**KERNEL)
+def pack(means, quats, log_scales, logits, sh, matrix):
+    """Tables of parameters to the rows of a matrix."""
+    for i in range(means.shape[0]):
+        for k in range(3):
+            matrix[MEAN + k, i] = means[i, k]
+            matrix[LOG_SCALE + k, i] = log_scales[i, k]
+            matrix[SH + k, i] = sh[i, 0, k]
+        for k in range(4):
+            matrix[QUAT + k, i] = quats[i, k]
+        matrix[LOGIT, i] = logits[i]
+
+
+@njit(**KERNEL)
+def unpack(matrix, rows, means, quats, log_scales, logits, sh):
+    """The matrix' columns named by `rows`, back to tables."""
+    for j in range(rows.size):
+        i = rows[j]
+        for k in range(3):
+            means[j, k] = matrix[MEAN + k, i]
+            log_scales[j, k] = matrix[LOG_SCALE + k, i]
+            sh[j, 0, k] = matrix[SH + k, i]
+        for k in range(4):
+            quats[j, k] = matrix[QUAT + k, i]
+        logits[j] = matrix[LOGIT, i]

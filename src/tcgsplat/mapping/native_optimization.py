@@ -1,5 +1,6 @@
 """A mapping update's optimisation by CPU kernels, without autograd; see `optimization.py` for what is optimised."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,18 +10,20 @@ import torch
 from tcgsplat.confidence import equations as eq
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
+from tcgsplat.mapping import loss_kernels
 from tcgsplat.mapping import native_kernels as kernels
 from tcgsplat.mapping.settings import MapperConfig
-from tcgsplat.render import ssim_kernels
 from tcgsplat.render.losses import SSIM_C1, SSIM_C2, ssim_window
 from tcgsplat.render.numba_cpu.layout import CHANNELS, FEATURE, PARAMETERS, Floats, aligned
-from tcgsplat.render.numba_cpu.passes import Passes
+from tcgsplat.render.numba_cpu.passes import Passes, Workspace
+from tcgsplat.render.numba_cpu.phases import COUNTERS
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
-from tcgsplat.tensors import PerGaussianFlag
+from tcgsplat.tensors import PerGaussian, PerGaussianFlag
 
 _FAINT = -60.0
 """Logit of an opacity that no rasterizer draws."""
+_LANES: Floats = np.arange(16, dtype=np.float32)
 
 
 def covers(config: MapperConfig, confidence: ConfidenceConfig) -> bool:
@@ -40,7 +43,6 @@ class _View:
         self.valid: Floats = frame.valid.numpy().astype(np.float32)
         self.depth: Floats = frame.depth.numpy() * self.valid
         self.measured = max(int((self.depth > 0).sum()), 1)
-        self.all_valid = bool(frame.valid.all())
 
 
 class NativeOptimization:
@@ -65,6 +67,8 @@ class NativeOptimization:
         self._scale = self._row(1.0, self._step_scale())
         self._excess: Floats = np.zeros(self._padded, np.float32)
         self._rates = _rates(config)
+        self._window = ssim_window().numpy()
+        self._space = Workspace()
 
     def step(self, view: int, frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
         """See `Optimization`."""
@@ -72,17 +76,14 @@ class NativeOptimization:
         target = self._view(view)
         drawn = self._passes.draw(self._parameters, target.camera, target.T_cam_map)
         d_planes = self._differentiated_losses(target, drawn.planes)
-        grads, _ = self._passes.differentiate(drawn, d_planes)
+        grads, _ = self._passes.differentiate(drawn, d_planes, self._space.floats("grads", PARAMETERS, self._padded))
         visible = drawn.visible.astype(np.float32)
-        constants = self._constants(visible, pace)
-        self._passes._workers.run(
-            lambda a, b: kernels.adam_step(
-                self._padded, a, b, _flat(self._raw), _flat(self._parameters), _flat(self._before), _flat(self._first),
-                _flat(self._second), _flat(self._clocks), _flat(grads), visible, self._allowed, self._scale, constants,
-                self._excess,
-            ),
-            self._passes._workers.cuts(self._padded, 16),
+        arrays = (
+            self._padded, _flat(self._raw), _flat(self._parameters), _flat(self._before), _flat(self._first),
+            _flat(self._second), _flat(self._clocks), _flat(grads), visible, self._allowed, self._scale,
+            self._constants(visible, pace), self._excess,
         )  # fmt: skip
+        self._share(kernels.adam_step, 1, lambda _: arrays)
 
     def prune(self) -> None:
         """See `Optimization`. Rows stay where they are until the end; a faint one is simply never drawn again."""
@@ -96,9 +97,20 @@ class NativeOptimization:
 
     def submap(self) -> Submap:
         """See `Optimization`."""
-        n = len(self._submap)
-        alive = torch.from_numpy(self._raw[kernels.LOGIT, :n] > _FAINT)
-        return replace(self._submap, gaussians=_gaussians(self._raw[:, :n], self._submap.gaussians)).kept(alive)
+        submap, rows = self._submap, self._survivors()
+        if len(rows) < len(submap):
+            submap = submap.kept(torch.from_numpy(self._raw[kernels.LOGIT, : len(submap)] > _FAINT))
+        return replace(submap, gaussians=_gaussians(self._raw, rows, submap.gaussians))
+
+    def self_distance(self) -> PerGaussian:
+        """See `Optimization`."""
+        distances: Floats = aligned(self._padded)  # type: ignore[assignment]
+        constants = self._constants(np.zeros(self._padded, np.float32), 1.0)
+        kernels.self_distances(_flat(self._raw), _flat(self._before), self._padded, constants, distances)
+        return torch.from_numpy(distances[self._survivors()])
+
+    def _survivors(self) -> npt.NDArray[np.int64]:
+        return np.flatnonzero(self._raw[kernels.LOGIT, : len(self._submap)] > _FAINT)
 
     def _kept(self) -> npt.NDArray[np.bool_]:
         opacity = 1.0 / (1.0 + np.exp(-self._raw[kernels.LOGIT]))
@@ -111,38 +123,37 @@ class NativeOptimization:
 
     def _differentiated_losses(self, view: _View, planes: Floats) -> Floats:
         """The derivative of Eq. 21 by the images; keeps its value."""
-        config, workers = self._config, self._passes._workers
+        config, space = self._config, self._space
         _, height, width = planes.shape
-        window, c1, c2 = ssim_window().numpy(), np.float32(SSIM_C1), np.float32(SSIM_C2)
-        shown = planes[:3] if view.all_valid else np.empty((3, height, width), np.float32)
-        similarity, by_mean, by_aa, by_ab = np.empty((4, 3, height, width), np.float32)
-        upstream = np.full((3, height, width), -config.ssim_weight / (3 * height * width), np.float32)
-        d_planes, sums = np.empty((CHANNELS, height, width), np.float32), np.empty(height, np.float32)
-        channel = 5 if config.depth_mode == "planar" else 4
         constants = np.array(
             [
                 config.color_weight / view.measured, config.depth_weight / view.measured,
-                self._confidence.guide_mapping, channel, config.depth_mode != "composited",
+                self._confidence.guide_mapping, 5 if config.depth_mode == "planar" else 4,
+                config.depth_mode != "composited", -config.ssim_weight / (3 * height * width), SSIM_C1, SSIM_C2,
             ],
             np.float32,
         )  # fmt: skip
-        cuts = workers.cuts(height)
-        if not view.all_valid:
-            kernels.seen_by_both(0, height, planes, view.color, view.valid, shown)
-        workers.run(
-            lambda a, b: ssim_kernels.forward(
-                shown, view.color, window, c1, c2, a, b, similarity, by_mean, by_aa, by_ab
+        threads, pixels = self._passes.workers.threads, height * width
+        d_planes, sums = space.floats("d_planes", CHANNELS, height, width), space.floats("sums", 2, height)
+        lines = space.floats("lines", threads, loss_kernels.LINES * (width + 2 * loss_kernels.MARGIN))
+        lines[:] = 0.0
+        rows, partials = space.floats("rows", 3 * loss_kernels.LINES * pixels), space.floats("partials", 9 * pixels)
+        images = (_flat(planes), _flat(view.color), _flat(view.depth), _flat(view.valid))
+        self._share(
+            loss_kernels.differentiate_losses,
+            loss_kernels.PHASES,
+            lambda worker: (
+                width, height, *images, self._window, _LANES, constants, lines[worker], rows, partials,
+                _flat(d_planes), sums,
             ),
-            cuts,
-        )
-
-        def differentiate(a: int, b: int) -> None:
-            ssim_kernels.backward(upstream, shown, view.color, by_mean, by_aa, by_ab, window, a, b, d_planes[:3])  # type: ignore[call-arg]
-            kernels.pixel_losses(a, b, planes, view.color, view.depth, view.valid, constants, d_planes, sums)
-
-        workers.run(differentiate, cuts)
-        self._reconstruction = float(sums.sum(dtype=np.float64)) + config.ssim_weight * (1.0 - float(similarity.mean()))
+        )  # fmt: skip
+        similarity, reconstruction = (float(total) for total in sums.sum(axis=1, dtype=np.float64))
+        self._reconstruction = reconstruction + config.ssim_weight * (1.0 - similarity / (3 * pixels))
         return d_planes
+
+    def _share(self, kernel: Callable[..., bool], phases: int, arguments: Callable[[int], tuple[object, ...]]) -> None:
+        """A kernel on all threads; `arguments` are those of each worker."""
+        self._passes.workers.share(kernel, self._space.longs("progress", phases * COUNTERS), arguments)
 
     def _row(self, padding: float, values: torch.Tensor | None) -> Floats:
         """A value for each Gaussian, padded; all padding where there are none."""
@@ -198,25 +209,25 @@ def _rates(config: MapperConfig) -> Floats:
 
 def _matrix(gaussians: Gaussians, padded: int) -> Floats:
     """Raw parameters as rows; padding is too faint to be drawn."""
-    n = len(gaussians)
     matrix: Floats = aligned((kernels.ROWS, padded))  # type: ignore[assignment]
-    matrix[:, n:] = 1.0
-    matrix[kernels.LOGIT, n:] = _FAINT
-    columns = (
-        gaussians.means,
-        gaussians.quats,
-        gaussians.log_scales,
-        gaussians.logit_opacities[:, None],
-        gaussians.sh[:, 0],
-    )
-    matrix[:, :n] = torch.cat([column.detach() for column in columns], dim=1).T.numpy()
+    matrix[:, len(gaussians) :] = 1.0
+    matrix[kernels.LOGIT, len(gaussians) :] = _FAINT
+    columns = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh)
+    kernels.pack(*(np.ascontiguousarray(column.detach().numpy()) for column in columns), matrix)
     return matrix
 
 
-def _gaussians(matrix: Floats, template: Gaussians) -> Gaussians:
-    """Back from rows."""
-    table = torch.from_numpy(np.ascontiguousarray(matrix.T))
-    means, quats, log_scales, logits, sh = (part.contiguous() for part in torch.split(table, [3, 4, 3, 1, 3], dim=1))
+def _gaussians(matrix: Floats, rows: npt.NDArray[np.int64], template: Gaussians) -> Gaussians:
+    """Some of the columns as Gaussians with the template's ids."""
+    n = len(rows)
+    means, quats, log_scales = (np.empty((n, width), np.float32) for width in (3, 4, 3))
+    logits, sh = np.empty(n, np.float32), np.empty((n, 1, 3), np.float32)
+    kernels.unpack(matrix, rows, means, quats, log_scales, logits, sh)
     return replace(
-        template, means=means, quats=quats, log_scales=log_scales, logit_opacities=logits[:, 0], sh=sh[:, None]
+        template,
+        means=torch.from_numpy(means),
+        quats=torch.from_numpy(quats),
+        log_scales=torch.from_numpy(log_scales),
+        logit_opacities=torch.from_numpy(logits),
+        sh=torch.from_numpy(sh),
     )

@@ -47,6 +47,10 @@ class Optimization(Protocol):
         """The submap as it is now, a value that later steps leave alone."""
         ...
 
+    def self_distance(self) -> PerGaussian:
+        """How far each Gaussian of the submap has moved since the beginning (Eq. 8), metres."""
+        ...
+
 
 def begin(submap: Submap, config: MapperConfig, confidence: ConfidenceConfig, rasterizer: Rasterizer) -> Optimization:
     """The fastest optimisation that the rasterizer and the settings allow."""
@@ -103,6 +107,10 @@ class AutogradOptimization:
     def submap(self) -> Submap:
         """See `Optimization`."""
         return replace(self._submap, gaussians=self._adam.detached())
+
+    def self_distance(self) -> PerGaussian:
+        """See `Optimization`."""
+        return self_distance(self._adam.detached(), self._before, self._confidence)
 
     def _loss(
         self, rendering: Rendering, frame: Frame, gaussians: Gaussians, before: Gaussians, submap: Submap

@@ -125,7 +125,7 @@ class Passes:
         `lap` is called with its name at the end of every stage: project, sort, bin, forward; backward, chain. Between
         stages all threads then meet, which they do not otherwise.
         """
-        self._workers = Workers(threads or available_cores())
+        self.workers = Workers(threads or available_cores())
         self._lap = lap
         self._idle: deque[Workspace] = deque()
         self._grid: Floats = aligned(LANE_GRID.shape)  # type: ignore[assignment]
@@ -143,7 +143,7 @@ class Passes:
         padded, width, height = parameters.shape[1], camera.width, camera.height
         cam, flat = camera_vector(camera, T_cam_map), parameters.reshape(-1)
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-        tiles, strips, units = tiles_x * tiles_y, self._workers.threads, -(-padded // kernels.UNIT)
+        tiles, strips, units = tiles_x * tiles_y, self.workers.threads, -(-padded // kernels.UNIT)
         records, depths = space.floats("records", padded * RECORD), space.floats("depths", padded)
         rectangles, slot_starts = space.counts("rectangles", 2 * padded), space.counts("slot_starts", padded + 1)
         entries, unit_sums = space.longs("entries", padded), space.longs("unit_sums", units, 3)
@@ -193,7 +193,7 @@ class Passes:
         _, height, width = d_planes.shape
         pair_sums = space.floats("pair_sums", max(drawn.masks.size, 1) * RECORD)
         pose_sums = space.floats("pose_sums", -(-padded // kernels.UNIT), projection.POSE_SUMS)
-        local = space.floats("local", self._workers.threads, BACKWARD_FLOATS)
+        local = space.floats("local", self.workers.threads, BACKWARD_FLOATS)
         out: Floats = aligned((PARAMETERS, padded)) if grads is None else grads  # type: ignore[assignment]
         blending = (
             drawn.tile_ends, drawn.pairs, drawn.records, drawn.tiles_x, width, height, self._grid, drawn.masks,
@@ -237,9 +237,9 @@ class Passes:
                 time.sleep(0)
 
         if self._lap is None:
-            self._workers.together(work)
+            self.workers.together(work)
             return
         for stage, last_phase in stages.items():  # noqa: B007  read by `work`
-            self._workers.together(work)
+            self.workers.together(work)
             if stage:
                 self._lap(stage)

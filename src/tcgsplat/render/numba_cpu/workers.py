@@ -1,8 +1,15 @@
 """Threads that share nogil kernels; the calling thread is one of them."""
 
 import os
+import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import numpy.typing as npt
+
+Arguments = tuple[object, ...]
 
 
 def available_cores() -> int:
@@ -15,6 +22,7 @@ class Workers:
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
+        self._door, self._callers = threading.Lock(), 0
         self._helpers = ThreadPoolExecutor(threads - 1, thread_name_prefix="splat") if threads > 1 else None
 
     def together(self, work: Callable[[int], object], threads: int | None = None) -> None:
@@ -22,14 +30,31 @@ class Workers:
 
         A helper may come late, when all is done, or never: `work` must share itself out as threads come.
         """
-        helpers = min(threads or self.threads, self.threads) - 1
+        with self._door:
+            self._callers += 1
+            helpers = max(min(threads or self.threads, self.threads - self._callers + 1) - 1, 0)
         futures = [self._helpers.submit(work, k + 1) for k in range(helpers)] if self._helpers else []
         try:
             work(0)
         finally:
+            with self._door:
+                self._callers -= 1
             for future in futures:
                 if not future.cancel():
                     future.result()
+
+    def share(
+        self, kernel: Callable[..., bool], progress: npt.NDArray[np.int64], arguments: Callable[[int], Arguments]
+    ) -> None:
+        """Run a kernel of phases (see `phases.py`) on all threads, each with its own arguments after `progress`."""
+        progress[:] = 0
+
+        def work(worker: int) -> None:
+            own = arguments(worker)
+            while not kernel(progress, *own):
+                time.sleep(0)
+
+        self.together(work)
 
     def run(self, work: Callable[[int, int], object], cuts: list[int]) -> None:
         """Call `work(from, to)` for consecutive cuts, side by side; the first exception is raised."""
