@@ -164,3 +164,43 @@ def test_gather_squares_takes_four_pixels_for_every_lane():
     _squares(image, x, y, out.reshape(-1))
     for square, column, row in zip(out, x.astype(int), y.astype(int), strict=True):
         np.testing.assert_array_equal(square, image[row : row + 2, column : column + 2])
+
+
+@njit(fastmath=simd.MATH)
+def _matrices(rows, out):
+    A, B = simd.load_rows(rows, 0, 16, 9), simd.load_rows(rows, 144, 16, 9)
+    simd.store_rows(out, 0, 16, simd.product(A, B))
+    simd.store_rows(out, 144, 16, simd.transposed(A))
+    simd.store_rows(out, 288, 16, simd.times_columns(A, B[:3]))
+    simd.store_rows(out, 432, 32, (simd.dot(A[:4], B[:4]), simd.load_spread(rows, 5, 2)[1]))
+
+
+def test_matrices_are_lane_by_lane():
+    rows, out = np.random.default_rng(2).normal(size=(18, 16)).astype(np.float32), np.zeros((30, 16), np.float32)
+    _matrices(rows.reshape(-1), out.reshape(-1))
+    A, B = rows[:9].T.reshape(16, 3, 3), rows[9:].T.reshape(16, 3, 3)
+
+    def close(row: int, expected: np.ndarray) -> None:
+        flat = expected.reshape(16, -1)
+        np.testing.assert_allclose(out[row : row + flat.shape[1]].T, flat, rtol=1e-5, atol=1e-6)
+
+    close(0, A @ B)
+    close(9, A.transpose(0, 2, 1))
+    close(18, A * B[:, :1])
+    close(27, (rows[:4] * rows[9:13]).sum(axis=0))
+    close(29, np.full(16, rows[0, 6]))
+
+
+@njit
+def _copy_first(source, at, count, out):
+    simd.store_first(out, at, simd.load_first(source, at, count), count)
+    simd.store(out, 32, simd.load_first(source, at, count))
+
+
+@pytest.mark.parametrize("count", [0, 5, 16])
+def test_first_lanes_are_all_that_is_touched(count):
+    source, out = np.arange(1, 17, dtype=np.float32), np.full(48, -1, np.float32)
+    _copy_first(source[16 - count :] if count else source[:0], 0, count, out)
+    np.testing.assert_array_equal(out[:count], source[16 - count :] if count else [])
+    assert (out[count:32] == -1).all()
+    assert (out[32 + count :] == 0).all()

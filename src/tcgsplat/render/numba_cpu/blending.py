@@ -14,6 +14,7 @@ import math
 import numpy as np
 from numba import carray, njit
 
+from tcgsplat.render.numba_cpu.compilation import kept
 from tcgsplat.render.numba_cpu.layout import (
     BLOCK_X,
     BLOCK_Y,
@@ -46,6 +47,8 @@ from tcgsplat.render.numba_cpu.simd import (
     fma,
     lane_sums,
     load,
+    load_first,
+    load_rows,
     mask_ge,
     maximum,
     minimum,
@@ -54,6 +57,8 @@ from tcgsplat.render.numba_cpu.simd import (
     spread,
     stack_floats,
     store,
+    store_first,
+    store_rows,
     trailing_zeros,
     where_ge,
 )
@@ -61,7 +66,7 @@ from tcgsplat.render.protocol import MIN_ALPHA, MIN_TRANSMITTANCE
 
 _LOG2_MIN_ALPHA = np.float32(math.log2(MIN_ALPHA))
 _MIN_TRANSMITTANCE = np.float32(MIN_TRANSMITTANCE)
-BACKWARD_FLOATS = 2 * (TILE_PIXELS + TILE_FLOATS)
+BACKWARD_FLOATS = 2 * TILE_PIXELS
 """Length of the `local` that `backward` needs."""
 _AHEAD = 24  # records asked for in advance: about the latency of memory over the time of one ellipse test
 
@@ -86,7 +91,7 @@ def _blocks_touched(records, at, origin_x, origin_y, grid):
     return mask_ge(maximum(on_column, on_row), spread(_LOG2_MIN_ALPHA - records[at + RECORD_LOG2_OPACITY]))
 
 
-@njit(fastmath=MATH, **INNER)
+@kept(njit(fastmath=MATH, **INNER))
 def forward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, height, grid, local, lists, masks, planes):
     """Composite a range of tiles into `planes` and leave in `masks` the blocks that each pair drew.
 
@@ -147,10 +152,10 @@ def forward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, heigh
             store(blocks, out + 1024, cz)
             store(blocks, out + 1280, cp)
             store(blocks, out + 1536, one - T)
-        _blocks_to_planes(blocks, tile, tiles_x, width, height, planes, local)
+        _from_blocks(blocks, tile, tiles_x, width, height, planes)
 
 
-@njit(fastmath=MATH, **INNER)
+@kept(njit(fastmath=MATH, **INNER))
 def backward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, height, grid, masks, planes, d_planes, local, pair_sums):
     """Sums over pixels for each pair of a range of tiles, sixteen floats a slot, from the loss's derivative by the planes.
 
@@ -160,19 +165,12 @@ def backward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, heig
     """
     d_blocks = carray(stack_floats(1792), TILE_FLOATS)
     transmittance, remaining = local[:TILE_PIXELS], local[TILE_PIXELS : 2 * TILE_PIXELS]
-    clipped, d_clipped = local[2 * TILE_PIXELS : 2 * TILE_PIXELS + TILE_FLOATS], local[2 * TILE_PIXELS + TILE_FLOATS : BACKWARD_FLOATS]
     last_pair = np.int64(tile_ends[tile_ends.size - 1]) - 1
     threshold, zero, one = spread(_LOG2_MIN_ALPHA), spread(np.float32(0)), spread(np.float32(1))
     lane_x, lane_y = load(grid, LANE_X), load(grid, LANE_Y)
     for tile in range(tile_from, tile_to):
-        x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-        origin_x, origin_y = np.float32(x0), np.float32(y0)
-        if x0 + TILE <= width and y0 + TILE <= height:
-            _to_blocks(planes, d_planes, y0 * width + x0, width, width * height, d_blocks, remaining)
-        else:
-            _clip(planes, x0, y0, width, height, clipped)
-            _clip(d_planes, x0, y0, width, height, d_clipped)
-            _to_blocks(clipped, d_clipped, np.int64(0), np.int64(TILE), np.int64(TILE_PIXELS), d_blocks, remaining)
+        origin_x, origin_y = np.float32((tile % tiles_x) * TILE), np.float32((tile // tiles_x) * TILE)
+        _to_blocks(planes, d_planes, tile, tiles_x, width, height, d_blocks, remaining)
         for block in range(16):
             store(transmittance, block * 16, one)
         for pair in range(tile_ends[tile], tile_ends[tile + 1]):
@@ -214,61 +212,47 @@ def backward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, heig
             store(pair_sums, (pairs[pair] >> 32) * RECORD, sums)
 
 
-@njit(fastmath=MATH, **INNER)
-def _blocks_to_planes(blocks, tile, tiles_x, width, height, planes, rows):
-    """A tile's blocks to its rows of the planes, one row of blocks at a time; `rows` has space for one."""
-    x0, y0 = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
-    columns, lines = min(TILE, width - x0), min(TILE, height - y0)
-    for channel in range(CHANNELS):
-        for y in range(0, lines, 4):
-            at = channel * TILE_PIXELS + y * TILE
-            r0, r1, r2, r3 = regrouped(load(blocks, at), load(blocks, at + 16), load(blocks, at + 32), load(blocks, at + 48))
-            out = (channel * height + y0 + y) * width + x0
-            if columns == TILE and y + 4 <= lines:
-                store(planes, out, r0)
-                store(planes, out + width, r1)
-                store(planes, out + 2 * width, r2)
-                store(planes, out + 3 * width, r3)
-            else:
-                store(rows, 0, r0)
-                store(rows, 16, r1)
-                store(rows, 32, r2)
-                store(rows, 48, r3)
-                for line in range(min(4, lines - y)):
-                    for x in range(columns):
-                        planes[out + line * width + x] = rows[line * 16 + x]
+@kept(njit(**INNER))
+def _columns(tile, tiles_x, width, height, line):  # type: ignore[no-untyped-def]
+    """Where a tile's row of pixels begins in a plane, and how many of its pixels are in the image."""
+    x, y = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE + line
+    return y * width + x, min(TILE, width - x) if y < height else 0
 
 
-@njit(**INNER)
-def _clip(planes, x0, y0, width, height, out):  # type: ignore[no-untyped-def]
-    """A tile that hangs over the image's edge, row by row; zeros beyond the edge."""
-    for k in range(TILE_FLOATS):
-        out[k] = np.float32(0)
-    for channel in range(CHANNELS):
-        for y in range(min(TILE, height - y0)):
-            for x in range(min(TILE, width - x0)):
-                out[(channel * TILE + y) * TILE + x] = planes[(channel * height + y0 + y) * width + x0 + x]
-
-
-@njit(fastmath=MATH, **INNER)
-def _to_blocks(planes, d_planes, start, pitch, plane, d_blocks, products):
-    """A tile's rows of `d_planes` to blocks, and by pixel the product with `planes`, summed over the channels."""
-    zero = spread(np.float32(0))
-    for band in range(4):
-        p0, p1, p2, p3 = zero, zero, zero, zero
+@kept(njit(fastmath=MATH, **INNER))
+def _from_blocks(blocks, tile, tiles_x, width, height, planes):
+    """A tile's blocks to its pixels in the planes."""
+    for line in range(0, TILE, 4):
+        at0, n0 = _columns(tile, tiles_x, width, height, line)
+        at1, n1 = _columns(tile, tiles_x, width, height, line + 1)
+        at2, n2 = _columns(tile, tiles_x, width, height, line + 2)
+        at3, n3 = _columns(tile, tiles_x, width, height, line + 3)
         for channel in range(CHANNELS):
-            at = start + channel * plane + band * 4 * pitch
-            d0, d1, d2, d3 = load(d_planes, at), load(d_planes, at + pitch), load(d_planes, at + 2 * pitch), load(d_planes, at + 3 * pitch)
-            p0, p1 = fma(load(planes, at), d0, p0), fma(load(planes, at + pitch), d1, p1)
-            p2, p3 = fma(load(planes, at + 2 * pitch), d2, p2), fma(load(planes, at + 3 * pitch), d3, p3)
-            b0, b1, b2, b3 = regrouped(d0, d1, d2, d3)
-            out = channel * TILE_PIXELS + band * 64
-            store(d_blocks, out, b0)
-            store(d_blocks, out + 16, b1)
-            store(d_blocks, out + 32, b2)
-            store(d_blocks, out + 48, b3)
-        b0, b1, b2, b3 = regrouped(p0, p1, p2, p3)
-        store(products, band * 64, b0)
-        store(products, band * 64 + 16, b1)
-        store(products, band * 64 + 32, b2)
-        store(products, band * 64 + 48, b3)
+            b0, b1, b2, b3 = load_rows(blocks, channel * TILE_PIXELS + line * TILE, 16, 4)
+            r0, r1, r2, r3 = regrouped(b0, b1, b2, b3)
+            plane = channel * width * height
+            store_first(planes, plane + at0, r0, n0)
+            store_first(planes, plane + at1, r1, n1)
+            store_first(planes, plane + at2, r2, n2)
+            store_first(planes, plane + at3, r3, n3)
+
+
+@kept(njit(fastmath=MATH, **INNER))
+def _to_blocks(planes, d_planes, tile, tiles_x, width, height, d_blocks, products):
+    """A tile's pixels of `d_planes` to blocks, and by pixel the product with `planes`, summed over the channels."""
+    for line in range(0, TILE, 4):
+        at0, n0 = _columns(tile, tiles_x, width, height, line)
+        at1, n1 = _columns(tile, tiles_x, width, height, line + 1)
+        at2, n2 = _columns(tile, tiles_x, width, height, line + 2)
+        at3, n3 = _columns(tile, tiles_x, width, height, line + 3)
+        p0, p1, p2, p3 = spread(np.float32(0)), spread(np.float32(0)), spread(np.float32(0)), spread(np.float32(0))
+        for channel in range(CHANNELS):
+            plane = channel * width * height
+            d0, d1 = load_first(d_planes, plane + at0, n0), load_first(d_planes, plane + at1, n1)
+            d2, d3 = load_first(d_planes, plane + at2, n2), load_first(d_planes, plane + at3, n3)
+            p0 = fma(load_first(planes, plane + at0, n0), d0, p0)
+            p1 = fma(load_first(planes, plane + at1, n1), d1, p1)
+            p2 = fma(load_first(planes, plane + at2, n2), d2, p2)
+            p3 = fma(load_first(planes, plane + at3, n3), d3, p3)
+            store_rows(d_blocks, channel * TILE_PIXELS + line * TILE, 16, regrouped(d0, d1, d2, d3))
+        store_rows(products, line * TILE, 16, regrouped(p0, p1, p2, p3))

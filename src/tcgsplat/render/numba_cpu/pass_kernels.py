@@ -7,6 +7,7 @@ import numpy as np
 from numba import njit
 
 from tcgsplat.render.numba_cpu import blending, projection, tiling
+from tcgsplat.render.numba_cpu.compilation import kept
 from tcgsplat.render.numba_cpu.phases import WAITING, next_unit
 from tcgsplat.render.numba_cpu.simd import INNER, KERNEL
 
@@ -26,7 +27,7 @@ FILL, FORWARD = 0, 1
 BACKWARD, CHAIN = 0, 1
 
 
-@njit(**INNER)
+@kept(njit(**INNER))
 def _before(unit_sums, unit, column):  # type: ignore[no-untyped-def]
     total = np.int64(0)
     for k in range(unit):
@@ -34,7 +35,7 @@ def _before(unit_sums, unit, column):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(**KERNEL)
+@kept(njit(**KERNEL))
 def arrange(
     progress, last_phase, P, n, cam, tiles_x, records, depths, depth_bits, rectangles, unit_sums, slot_starts, entries,
     swapped, digit_counts, digit_ends, tile_counts, tile_ends,
@@ -94,7 +95,7 @@ def arrange(
     return True
 
 
-@njit(**KERNEL)
+@kept(njit(**KERNEL))
 def composite(
     progress, last_phase, entries, visible, rectangles, slot_starts, tiles_x, tile_counts, tile_ends, pairs, records,
     width, height, grid, local, lists, masks, planes,
@@ -121,7 +122,7 @@ def composite(
     return True
 
 
-@njit(**KERNEL)
+@kept(njit(**KERNEL))
 def differentiate(
     progress, last_phase, tile_ends, pairs, records, tiles_x, width, height, grid, masks, planes, d_planes, local,
     pair_sums, P, n, cam, slot_starts, grads, pose_sums,

@@ -4,6 +4,7 @@ Results do not depend on the number of threads: a tile is drawn by one thread, p
 fixed order, and pose sums over fixed units of splats.
 """
 
+import math
 import time
 import weakref
 from collections import deque
@@ -61,7 +62,7 @@ class Workspace:
         return self._array(name, shape, np.int64)  # type: ignore[return-value]
 
     def _array(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[np.generic]:
-        size = int(np.prod(shape))
+        size = math.prod(shape)
         if name not in self._arrays or self._arrays[name].size < size:
             self._arrays[name] = aligned(size + size // 4, dtype)  # room to grow
         return self._arrays[name][:size].reshape(shape)

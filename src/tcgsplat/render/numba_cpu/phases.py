@@ -16,6 +16,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
+from tcgsplat.render.numba_cpu.compilation import kept
 from tcgsplat.render.numba_cpu.simd import INNER
 
 OVER, WAITING = -1, -2
@@ -55,7 +56,7 @@ def _look(typingctx: Any, array: Any, index: Any) -> Any:
     return types.int64(array, types.int64), lower
 
 
-@njit(**INNER)
+@kept(njit(**INNER))
 def next_unit(progress, phase, units, finished):  # type: ignore[no-untyped-def]
     """The next of a phase's units (0 .. units-1), or OVER, or WAITING. `finished`: the caller has just done one (0 or 1)."""
     at = np.int64(phase) * COUNTERS

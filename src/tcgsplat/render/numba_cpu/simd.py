@@ -146,6 +146,87 @@ def store_int32_pairs(typingctx: Any, array: Any, index: Any, first: Any, second
     return types.void(array, types.int64, float32x16, float32x16), lower
 
 
+def _first_lanes(builder: Any, count: Any) -> Any:
+    """Which lanes come before `count`, an int64."""
+    undefined, lanes = ir.Constant(_VI, ir.Undefined), ir.Constant(_VI, list(range(LANES)))
+    first = builder.insert_element(undefined, builder.trunc(count, _I32), ir.Constant(_I32, 0))
+    return builder.icmp_signed("<", lanes, builder.shuffle_vector(first, undefined, ir.Constant(_VI, [0] * LANES)))
+
+
+@intrinsic
+def load_first(typingctx: Any, array: Any, index: Any, count: Any) -> Any:
+    """The `count` floats from `index` on in the first lanes, 0 in the rest, of which memory is not touched."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind = ir.FunctionType(_VF, [_VF.as_pointer(), _I32, _VB, _VF])
+        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.load.v{LANES}f32.p0")
+        pointer = _pointer(context, builder, sig.args[0], args[0], args[1], _VF)
+        return builder.call(function, [pointer, ir.Constant(_I32, 4), _first_lanes(builder, args[2]), _constant(0.0)])
+
+    return float32x16(array, types.int64, types.int64), lower
+
+
+@intrinsic
+def store_first(typingctx: Any, array: Any, index: Any, value: Any, count: Any) -> Any:
+    """Write the first `count` lanes from `index` on, and nothing else."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind = ir.FunctionType(ir.VoidType(), [_VF, _VF.as_pointer(), _I32, _VB])
+        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.store.v{LANES}f32.p0")
+        pointer = _pointer(context, builder, sig.args[0], args[0], args[1], _VF)
+        builder.call(function, [args[2], pointer, ir.Constant(_I32, 4), _first_lanes(builder, args[3])])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, float32x16, types.int64), lower
+
+
+@intrinsic
+def load_rows(typingctx: Any, array: Any, index: Any, pitch: Any, count: Any) -> Any:
+    """Tuple of `count` (a literal) vectors that begin at index, index + pitch, ..."""
+    if not isinstance(count, types.IntegerLiteral):
+        return None
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        rows, at = [], args[1]
+        for _ in range(sig.return_type.count):
+            rows.append(builder.load(_pointer(context, builder, sig.args[0], args[0], at, _VF), align=4))
+            at = builder.add(at, args[2])
+        return context.make_tuple(builder, sig.return_type, rows)
+
+    return types.UniTuple(float32x16, count.literal_value)(array, types.int64, types.int64, count), lower
+
+
+@intrinsic
+def store_rows(typingctx: Any, array: Any, index: Any, pitch: Any, rows: Any) -> Any:
+    """Write a tuple of vectors from index, index + pitch, ... on."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        at = args[1]
+        for k in range(sig.args[3].count):
+            row = builder.extract_value(args[3], k)
+            builder.store(row, _pointer(context, builder, sig.args[0], args[0], at, _VF), align=4)
+            at = builder.add(at, args[2])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, types.int64, rows), lower
+
+
+@intrinsic
+def load_spread(typingctx: Any, array: Any, index: Any, count: Any) -> Any:
+    """Tuple of `count` (a literal) vectors: one float of the array in every lane, then the next."""
+    if not isinstance(count, types.IntegerLiteral):
+        return None
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        first = _pointer(context, builder, sig.args[0], args[0], args[1], _F32)
+        floats = [
+            builder.load(builder.gep(first, [ir.Constant(_I64, k)]), align=4) for k in range(sig.args[2].literal_value)
+        ]
+        return context.make_tuple(builder, sig.return_type, [_spread(builder, value) for value in floats])
+
+    return types.UniTuple(float32x16, count.literal_value)(array, types.int64, count), lower
+
+
 @intrinsic
 def fma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
     """A * b + c, fused where the processor can (llvm.fmuladd: never a library call)."""
@@ -161,6 +242,66 @@ def _fma(builder: Any, a: Any, b: Any, c: Any) -> Any:
     return builder.call(
         cgutils.get_or_insert_function(builder.module, ir.FunctionType(_VF, [_VF] * 3), name), [a, b, c]
     )
+
+
+def _dot(builder: Any, a: Sequence[Any], b: Sequence[Any]) -> Any:
+    total = builder.fmul(a[0], b[0], flags=_FLAGS)
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = _fma(builder, x, y, total)
+    return total
+
+
+@intrinsic
+def dot(typingctx: Any, a: Any, b: Any) -> Any:
+    """Scalar product of two tuples of vectors, lane by lane.
+
+    This and `product` say in one call what many operators would: compiling takes time by the call.
+    """
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        a, b = (
+            [builder.extract_value(arg, k) for k in range(kind.count)] for arg, kind in zip(args, sig.args, strict=True)
+        )
+        return _dot(builder, a, b)
+
+    return float32x16(a, b), lower
+
+
+@intrinsic
+def product(typingctx: Any, a: Any, b: Any) -> Any:
+    """Matrix product of two 3 x 3 matrices, lane by lane; tuples of nine vectors, row by row."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        a, b = ([builder.extract_value(arg, k) for k in range(9)] for arg in args)
+        entries = [_dot(builder, a[3 * row : 3 * row + 3], b[column::3]) for row in range(3) for column in range(3)]
+        return context.make_tuple(builder, sig.return_type, entries)
+
+    return types.UniTuple(float32x16, 9)(a, b), lower
+
+
+@intrinsic
+def transposed(typingctx: Any, a: Any) -> Any:
+    """Transpose of a 3 x 3 matrix, a tuple of nine."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        entries = [builder.extract_value(args[0], 3 * column + row) for row in range(3) for column in range(3)]
+        return context.make_tuple(builder, sig.return_type, entries)
+
+    return types.UniTuple(float32x16, 9)(a), lower
+
+
+@intrinsic
+def times_columns(typingctx: Any, a: Any, scales: Any) -> Any:
+    """A 3 x 3 matrix, a tuple of nine, with its columns multiplied by the three of `scales`."""
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        entries = [
+            builder.fmul(builder.extract_value(args[0], k), builder.extract_value(args[1], k % 3), flags=_FLAGS)
+            for k in range(9)
+        ]
+        return context.make_tuple(builder, sig.return_type, entries)
+
+    return types.UniTuple(float32x16, 9)(a, scales), lower
 
 
 @intrinsic
