@@ -53,6 +53,7 @@ from tcgsplat.render.numba_cpu.simd import (
     maximum,
     minimum,
     prefetch,
+    prefetch_to_write,
     regrouped,
     spread,
     stack_floats,
@@ -174,7 +175,9 @@ def backward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, heig
         for block in range(16):
             store(transmittance, block * 16, one)
         for pair in range(tile_ends[tile], tile_ends[tile + 1]):
-            prefetch(records, (pairs[min(pair + 8, last_pair)] & SPLAT) * RECORD)
+            ahead = pairs[min(pair + 8, last_pair)]
+            prefetch(records, (ahead & SPLAT) * RECORD)
+            prefetch_to_write(pair_sums, (ahead >> 32) * RECORD)
             at = (pairs[pair] & SPLAT) * RECORD
             from_center_x, from_center_y = lane_x - (records[at + U] - origin_x), lane_y - (records[at + V] - origin_y)
             g, gx, gy, gxx, gxy, gyy = zero, zero, zero, zero, zero, zero

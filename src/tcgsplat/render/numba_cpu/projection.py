@@ -35,11 +35,13 @@ from tcgsplat.render.numba_cpu.simd import (
     floor,
     lane_sums,
     load,
+    load_first,
     load_rows,
     load_spread,
     load_transposed,
     maximum,
     minimum,
+    prefetch,
     product,
     spread,
     sqrt,
@@ -62,6 +64,7 @@ _LN2 = np.float32(math.log(2))
 _ZERO, _ONE, _TWO, _PER_TILE = np.float32(0), np.float32(1), np.float32(2), np.float32(1 / TILE)
 _SPAN_UNIT = np.float32(SPAN_UNIT)
 
+_AHEAD = 128  # rows asked for in advance: the processor does not, across pages
 POSE_SUMS = 12
 """Numbers that `backward` sums for the pose: derivatives by the rotation (row by row) and the translation."""
 
@@ -150,16 +153,23 @@ def backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, pose):
     p00, p01, p02, p10, p11, p12 = zero, zero, zero, zero, zero, zero
     p20, p21, p22, pt0, pt1, pt2 = zero, zero, zero, zero, zero, zero
     row_x, row_y, row_z = load_spread(cam, ROTATION, 3), load_spread(cam, ROTATION + 3, 3), load_spread(cam, ROTATION + 6, 3)
-    tiny = spread(np.float32(1e-12))
+    tiny, last_slot = spread(np.float32(1e-12)), np.int64(slot_starts[n]) - 1
     for i in range(start, stop, 16):
         if slot_starts[i] == slot_starts[i + 16]:
             for row in range(PARAMETERS):
                 store(grads, row * n + i, zero)
             continue
         for k in range(16):
+            slot, end = np.int64(slot_starts[i + k]), np.int64(slot_starts[i + k + 1])
+            prefetch(pair_sums, min(slot + _AHEAD, last_slot) * RECORD)
+            prefetch(pair_sums, min(slot + _AHEAD + 1, last_slot) * RECORD)
             total = zero
-            for slot in range(np.int64(slot_starts[i + k]), np.int64(slot_starts[i + k + 1])):
+            for _ in range(4):  # mostly enough, and loads of nothing are cheaper than guessing how many there are
+                total = total + load_first(pair_sums, slot * RECORD, (end - slot) * RECORD)
+                slot += 1
+            while slot < end:
                 total = total + load(pair_sums, slot * RECORD)
+                slot += 1
             store(sums, k * RECORD, total)
         s, sx, sy, sxx, sxy, syy, d_f0, d_f1, d_f2, d_f3, d_z, d_plane, plane_x, plane_y, _, _ = load_transposed(sums, 0)
         point, (_, _, _, _, iz), (a, b, a_c, b_c), (ju, jv), J, (w, p, q, r, inverse_length), Q, N, scales, m = _expand(P, n, i, cam)

@@ -107,8 +107,9 @@ class _Draw(torch.autograd.Function):
     def backward(ctx: Any, d_planes: Tensor, _d_visible: Tensor) -> tuple[Tensor | None, ...]:
         opacities, _ = ctx.saved_tensors
         ctx.rasterizer.lap("autograd")
-        grads, d_T = ctx.rasterizer.passes.differentiate(ctx.drawn, d_planes.contiguous().numpy())
-        n = len(opacities)
+        n, drawn = len(opacities), ctx.drawn
+        grads = drawn.workspace.floats("grads", PARAMETERS, drawn.padded)
+        _, d_T = ctx.rasterizer.passes.differentiate(drawn, d_planes.contiguous().numpy(), grads)
 
         def rows(start: int, count: int) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(grads[start : start + count, :n].T))

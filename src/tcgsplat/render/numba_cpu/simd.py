@@ -11,6 +11,7 @@ lanes), loads and stores on flat float32 arrays, comparisons as 16-bit masks, ex
 import math
 import operator
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -62,9 +63,11 @@ def _spread(builder: Any, scalar: Any) -> Any:
     return builder.shuffle_vector(first, undefined, ir.Constant(_VI, [0] * LANES))
 
 
-def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any, pointee: Any) -> Any:
+def _pointer(
+    context: Any, builder: Any, array_type: Any, array: Any, index: Any, pointee: Any, inside: bool = True
+) -> Any:
     data = make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index], inbounds=True), pointee.as_pointer())
+    return builder.bitcast(builder.gep(data, [index], inbounds=inside), pointee.as_pointer())
 
 
 def _register_operator(op: Callable[..., Any], instruction: str) -> None:
@@ -155,12 +158,15 @@ def _first_lanes(builder: Any, count: Any) -> Any:
 
 @intrinsic
 def load_first(typingctx: Any, array: Any, index: Any, count: Any) -> Any:
-    """The `count` floats from `index` on in the first lanes, 0 in the rest, of which memory is not touched."""
+    """The `count` floats from `index` on in the first lanes, 0 in the rest, of which memory is not touched.
+
+    Less than 1 is none, more than sixteen are all.
+    """
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         kind = ir.FunctionType(_VF, [_VF.as_pointer(), _I32, _VB, _VF])
         function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.load.v{LANES}f32.p0")
-        pointer = _pointer(context, builder, sig.args[0], args[0], args[1], _VF)
+        pointer = _pointer(context, builder, sig.args[0], args[0], args[1], _VF, inside=False)
         return builder.call(function, [pointer, ir.Constant(_I32, 4), _first_lanes(builder, args[2]), _constant(0.0)])
 
     return float32x16(array, types.int64, types.int64), lower
@@ -173,7 +179,7 @@ def store_first(typingctx: Any, array: Any, index: Any, value: Any, count: Any) 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         kind = ir.FunctionType(ir.VoidType(), [_VF, _VF.as_pointer(), _I32, _VB])
         function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.masked.store.v{LANES}f32.p0")
-        pointer = _pointer(context, builder, sig.args[0], args[0], args[1], _VF)
+        pointer = _pointer(context, builder, sig.args[0], args[0], args[1], _VF, inside=False)
         builder.call(function, [args[2], pointer, ir.Constant(_I32, 4), _first_lanes(builder, args[3])])
         return context.get_dummy_value()
 
@@ -451,22 +457,26 @@ def append_where_bit(typingctx: Any, out: Any, count: Any, masks: Any, start: An
     return sig, lower
 
 
+def _prefetch(context: Any, builder: Any, sig: Any, args: Any, to_write: bool) -> Any:
+    byte_pointer = ir.IntType(8).as_pointer()
+    pointer = builder.bitcast(_pointer(context, builder, sig.args[0], args[0], args[1], ir.IntType(8)), byte_pointer)
+    function = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(ir.VoidType(), [byte_pointer, _I32, _I32, _I32]), "llvm.prefetch.p0"
+    )
+    builder.call(function, [pointer, *(ir.Constant(_I32, number) for number in (int(to_write), 3, 1))])
+    return context.get_dummy_value()
+
+
 @intrinsic
 def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
     """Ask for the cache line of `array[index]`; the index must be inside."""
+    return types.void(array, types.int64), partial(_prefetch, to_write=False)
 
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        byte_pointer = ir.IntType(8).as_pointer()
-        pointer = builder.bitcast(
-            _pointer(context, builder, sig.args[0], args[0], args[1], ir.IntType(8)), byte_pointer
-        )
-        function = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(ir.VoidType(), [byte_pointer, _I32, _I32, _I32]), "llvm.prefetch.p0"
-        )
-        builder.call(function, [pointer, ir.Constant(_I32, 0), ir.Constant(_I32, 3), ir.Constant(_I32, 1)])
-        return context.get_dummy_value()
 
-    return types.void(array, types.int64), lower
+@intrinsic
+def prefetch_to_write(typingctx: Any, array: Any, index: Any) -> Any:
+    """Ask for the cache line of `array[index]`, not to be shared; the index must be inside."""
+    return types.void(array, types.int64), partial(_prefetch, to_write=True)
 
 
 def _halves(group: int) -> tuple[list[int], list[int]]:
