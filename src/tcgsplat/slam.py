@@ -9,7 +9,7 @@ submap. Files, progress and pictures are made by whoever consumes the reports.
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import torch
 
@@ -24,6 +24,7 @@ from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory
+from tcgsplat.tensors import Pose
 from tcgsplat.tracking.delay import DepthDelay
 from tcgsplat.tracking.motion import ConstantVelocity
 from tcgsplat.tracking.synchronization import synchronized
@@ -65,6 +66,17 @@ class StepReport:
     """Wall time by stage: waiting for the map, tracking, growing the map."""
 
 
+@dataclass(frozen=True)
+class Reference:
+    """What frames are tracked against: the active submap, or where that is a few frames old and not yet optimised, the
+    one before it, which still shows the place better.
+    """
+
+    submap: Submap
+    T_map_reference: Pose = field(default_factory=se3.identity)
+    """The reference's frame in that of the active submap."""
+
+
 class Slam:
     """The whole online system; `step` it through the frames, then `finish`."""
 
@@ -83,6 +95,7 @@ class Slam:
         self.motion = ConstantVelocity()
         self.delay = DepthDelay()
         self.submap = self._anchored(se3.identity(), index=0)
+        self._reference = Reference(self.submap)
         self.atlas = Atlas().with_submap(self.submap.T_world_map)
         self.trajectory = Trajectory()
 
@@ -100,7 +113,7 @@ class Slam:
         applied = velocity * self.delay.seconds
         frame = self.delay.corrected(frame) if self._learns_delay else frame
         together = synchronized(frame, velocity) if self._synchronizes else frame
-        tracked = self._tracker.track(together, self.submap, guess=self.motion.predict(frame.timestamp))
+        tracked = self._tracked(together, guess=self.motion.predict(frame.timestamp))
         T_map_cam = tracked.T_map_cam
         advance = self.motion.advanced if tracked.converged else self.motion.coasted
         self.motion = advance(T_map_cam, frame.timestamp)
@@ -113,6 +126,7 @@ class Slam:
             update = self._finished_update() or update
             clock.lap("wait")
             sealed = self.submap.sealed(self.config.confidence)
+            self._reference = Reference(self.submap, se3.inverse(T_map_cam))
             self.submap = self._anchored(self.submap.T_world_map @ T_map_cam, index=len(self.atlas))
             self.atlas = self.atlas.with_submap(self.submap.T_world_map)
             self.motion, T_map_cam = self.motion.rebased(), se3.identity()
@@ -125,6 +139,8 @@ class Slam:
             together = synchronized(frame, self.motion.steady) if self._synchronizes else frame
             grown = self._mapper.grown(together, T_map_cam, self.submap)
             self.submap, self._since_mapped = grown.submap, 0
+            if not (grown.first and len(self._reference.submap)):
+                self._reference = Reference(self.submap)
             self._updating = self._mapping_thread.submit(self._updated, grown)
             clock.lap("grow")
             if self.config.schedule.map_lag == 0:
@@ -151,6 +167,12 @@ class Slam:
         self._finished_update()
         return self.submap.sealed(self.config.confidence) if self.submap.keyframes else None
 
+    def _tracked(self, frame: Frame, guess: Pose) -> Tracked:
+        """The frame's pose in the active submap, found in the reference."""
+        T_map_reference = self._reference.T_map_reference
+        tracked = self._tracker.track(frame, self._reference.submap, se3.inverse(T_map_reference) @ guess)
+        return replace(tracked, T_map_cam=T_map_reference @ tracked.T_map_cam)
+
     def _updated(self, grown: Grown) -> tuple[Submap, MapUpdate]:
         """Optimise (equations 20 to 24), then judge what moved (equations 4 to 15); runs beside tracking."""
         started = time.perf_counter()
@@ -164,7 +186,7 @@ class Slam:
         if self._updating is None:
             return None
         self.submap, update = self._updating.result()
-        self._updating = None
+        self._reference, self._updating = Reference(self.submap), None
         return update
 
     def _anchored(self, T_world_map: torch.Tensor, index: int) -> Submap:

@@ -14,9 +14,9 @@ from tcgsplat.tensors import Pose
 class ScheduleConfig:
     """Rhythm of mapping and size of submaps."""
 
-    map_every: int = 5
+    map_every: int = 6
     """Frames from one mapping update to the next; the first frame of a submap is always mapped. [base: Replica 5]"""
-    map_lag: int = 5
+    map_lag: int = 6
     """Frames after which tracking uses what a mapping update made, while the update is worked on beside tracking; 0:
     at once, as the paper has it, with tracking waiting. No later than the next update begins. What is seeded is
     tracked against at once in any case. [ours]"""

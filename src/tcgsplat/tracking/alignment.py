@@ -43,12 +43,12 @@ _HESSIAN_ENTRY = kernels.HESSIAN + 6 * _LOW - _LOW * (_LOW - 1) // 2 + _HIGH - _
 class AlignmentConfig:
     """Constants of the solver. [ours]: measured on six sequences (design/tracking-recipe.md)."""
 
-    iterations: tuple[int, ...] = (3, 2, 3)
+    iterations: tuple[int, ...] = (5, 3, 3)
     """Passes a level, finest first: full, half, quarter resolution; images more than 320 pixels wide get further
     levels with the passes of the last. [ours]"""
     stride: int = 3
     """Every how many pixels a point is taken where a level is more than 200 pixels wide; else all are. [ours]"""
-    depth_weight: float = 1.0
+    depth_weight: float = 0.7
     """Geometry over colour, after each has been divided by its own spread. [ours]"""
     min_alpha: float = 0.7
     """Rendered pixels below this coverage give no point. [ours]"""
@@ -166,7 +166,7 @@ class _Photometry:
         if sums[kernels.COLOR_WEIGHT] > 0:
             self.color_scale = max(0.008, float(sums[kernels.COLOR_SQUARES] / sums[kernels.COLOR_WEIGHT]) ** 0.5)
         if sums[kernels.DEPTH_WEIGHT] > 0:
-            self.depth_scale = max(0.3, float(sums[kernels.DEPTH_SQUARES] / sums[kernels.DEPTH_WEIGHT]) ** 0.5)
+            self.depth_scale = max(0.05, float(sums[kernels.DEPTH_SQUARES] / sums[kernels.DEPTH_WEIGHT]) ** 0.5)
         total = float(sums[kernels.GAIN_W])
         if total > _ENOUGH_FOR_EXPOSURE:
             reference, live = float(sums[kernels.GAIN_R]) / total, float(sums[kernels.GAIN_L]) / total
