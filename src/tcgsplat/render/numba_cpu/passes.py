@@ -37,6 +37,8 @@ from tcgsplat.render.numba_cpu.workers import Workers, available_cores
 from tcgsplat.render.protocol import JACOBIAN_MARGIN
 
 Arguments = tuple[Any, ...]
+_KEPT = 2
+"""Workspaces kept for later: one for mapping, one for tracking at the same time."""
 
 
 class Workspace:
@@ -128,7 +130,7 @@ class Passes:
         """
         self.workers = Workers(threads or available_cores())
         self._lap = lap
-        self._idle: deque[Workspace] = deque()
+        self._idle: deque[Workspace] = deque(maxlen=_KEPT)
         self._grid: Floats = aligned(LANE_GRID.shape)  # type: ignore[assignment]
         self._grid[:] = LANE_GRID
 

@@ -422,7 +422,8 @@ def trailing_zeros(typingctx: Any, mask: Any) -> Any:
 def append_where_bit(typingctx: Any, out: Any, count: Any, masks: Any, start: Any, bit: Any, length: Any) -> Any:
     """Append to `out[count:]` those of start .. start+length-1 whose mask has the bit, in order; gives how many.
 
-    `out` and `masks` are flat int32 arrays with sixteen spare entries at the end; `bit` is the mask's value 1 << b.
+    `out` and `masks` are flat int32 arrays with sixteen spare entries at the end, which may be written; `bit` is the
+    mask's value 1 << b.
     """
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -442,16 +443,26 @@ def append_where_bit(typingctx: Any, out: Any, count: Any, masks: Any, start: An
         )
         inside = builder.icmp_signed("<", lanes, spread_int(length_value))
         chosen = builder.and_(has_bit, inside)
-        indices = builder.add(lanes, spread_int(builder.trunc(start_value, _I32)))
         pointer = _pointer(context, builder, sig.args[0], out_value, count_value, _I32)
-        compress = cgutils.get_or_insert_function(
-            builder.module,
-            ir.FunctionType(ir.VoidType(), [_VI, _I32.as_pointer(), _VB]),
-            f"llvm.masked.compressstore.v{LANES}i32",
-        )
-        builder.call(compress, [indices, pointer, chosen])
-        count_bits = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_I16, [_I16]), "llvm.ctpop.i16")
-        return builder.zext(builder.call(count_bits, [builder.bitcast(chosen, _I16)]), _I64)
+        first = builder.trunc(start_value, _I32)
+        bits = builder.bitcast(chosen, _I16)
+        if "+avx512f" in context.codegen().magic_tuple()[2]:
+            # In a register: straight to memory takes some processors a hundred cycles.
+            compress = cgutils.get_or_insert_function(
+                builder.module, ir.FunctionType(_VI, [_VI, _VI, _VB]), f"llvm.x86.avx512.mask.compress.v{LANES}i32"
+            )
+            indices = builder.add(lanes, spread_int(first))
+            compressed = builder.call(compress, [indices, ir.Constant(_VI, [0] * LANES), chosen])
+            builder.store(compressed, builder.bitcast(pointer, _VI.as_pointer()), align=4)
+            count_bits = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_I16, [_I16]), "llvm.ctpop.i16")
+            return builder.zext(builder.call(count_bits, [bits]), _I64)
+        # Without branches: each is written, and overwritten if it was not chosen.
+        number, wide = ir.Constant(_I64, 0), builder.zext(bits, _I64)
+        for lane in range(LANES):
+            builder.store(builder.add(first, ir.Constant(_I32, lane)), builder.gep(pointer, [number]), align=4)
+            bit_of_lane = builder.lshr(wide, ir.Constant(_I64, lane))
+            number = builder.add(number, builder.and_(bit_of_lane, ir.Constant(_I64, 1)))
+        return number
 
     sig = types.int64(out, types.int64, masks, types.int64, types.int32, types.int32)
     return sig, lower
