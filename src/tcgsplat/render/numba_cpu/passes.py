@@ -10,6 +10,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -230,19 +231,15 @@ class Passes:
         space: Workspace,
     ) -> None:
         """A kernel on all threads, in one go; for `lap` stage by stage, which are given with their last phases."""
-        last_phase = max(stages.values())
-        progress = space.longs("progress", (last_phase + 1) * COUNTERS)
+        progress = space.longs("progress", (max(stages.values()) + 1) * COUNTERS)
         progress[:] = 0
 
-        def work(worker: int) -> None:
+        def work(last_phase: int, worker: int) -> None:
             own = arguments(worker)
             while not kernel(progress, last_phase, *own):
                 time.sleep(0)
 
-        if self._lap is None:
-            self.workers.together(work)
-            return
-        for stage, last_phase in stages.items():  # noqa: B007  read by `work`
-            self.workers.together(work)
-            if stage:
+        for stage, last_phase in stages.items() if self._lap else [("", max(stages.values()))]:
+            self.workers.together(partial(work, last_phase))
+            if self._lap and stage:
                 self._lap(stage)
