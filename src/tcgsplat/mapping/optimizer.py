@@ -22,8 +22,8 @@ PARAMETERS = (*GEOMETRY, "logit_opacities", "sh")
 class LearningRates:
     """Adam step sizes, in the parameters' own units. [base] throughout, where not said otherwise."""
 
-    means: float = 1e-4
-    """Metres."""
+    means: float = 3e-4
+    """Metres: three times the base system's step, for a tenth of its steps in an update. [ours] (base: 1e-4)"""
     log_scales: float = 5e-3
     quats: float = 1e-3
     logit_opacities: float = 0.05
