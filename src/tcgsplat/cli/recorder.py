@@ -175,12 +175,13 @@ def record(
         run.write_submap(last)
         gaussians += len(last)
     run.write_trajectory(slam.trajectory, slam.atlas)
-    return tally.summary(
+    summary = tally.summary(
         submaps=run.submap_count,
         gaussians=gaussians,
         seconds=time.perf_counter() - started,
         interrupted=interrupted,
     )
+    return replace(summary, depth_delay_ms=1e3 * slam.delay.seconds)
 
 
 @contextmanager

@@ -52,6 +52,8 @@ class Summary:
     """Of the same: what 95 % of the frames stay below."""
     seconds_held: float = 0.0
     """In which the playback stood still, because an image was not decoded yet; a live camera does not wait."""
+    depth_delay_ms: float = 0.0
+    """How much later than their stamps say the depth images were taken, as the run has learnt it."""
     seconds_compiling: float = 0.0
     """Before the first frame; next to nothing once the kernels are in numba's cache."""
     backend: str = ""

@@ -22,6 +22,7 @@ from tcgsplat.evaluation import ate, canvas
 from tcgsplat.evaluation.canvas import Picture
 from tcgsplat.evaluation.views import (
     PosedFrame,
+    learnt_delay,
     training_views,
     velocities_by_frame,
     withheld_rows,
@@ -119,7 +120,7 @@ def contact_sheet_of(
     for submap_index, group in groupby((shown[i] for i in places), key=lambda row: row.submap_index):
         submap, chosen = run.load_submap(submap_index), list(group)
         if withheld and sequence is not None:
-            posed = withheld_views(chosen, velocities, sequence)
+            posed = withheld_views(chosen, velocities, sequence, learnt_delay(run))
         else:
             posed = _nearest(submap, chosen)
         views += [_view(submap, one, rasterizer, start=rows[0].timestamp) for one in posed]

@@ -17,6 +17,7 @@ from tcgsplat.evaluation.views import (
     MOST_WITHHELD,
     ViewScore,
     in_turn,
+    learnt_delay,
     spread,
     training_views,
     velocities_by_frame,
@@ -266,7 +267,7 @@ def _quality(
     for index in range(run.submap_count):
         submap = run.load_submap(index)
         rows = [row for row in withheld if row.submap_index == index]
-        unseen = withheld_views(rows, velocities, sequence) if sequence is not None else iter(())
+        unseen = withheld_views(rows, velocities, sequence, learnt_delay(run)) if sequence is not None else iter(())
         for view in in_turn(training_views(submap, slice(-seen % stride, None, stride)), unseen):
             rendering = render_view(submap, view.frame.camera, view.T_map_cam, rasterizer)
             scores[view.withheld].append(ViewScore.of(rendering, view.frame))

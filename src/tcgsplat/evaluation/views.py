@@ -3,7 +3,7 @@
 import heapq
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -101,7 +101,7 @@ def training_views(submap: Submap, places: slice) -> Iterator[PosedFrame]:
 
 
 def withheld_views(
-    rows: Iterable[TrackedPose], velocities: Mapping[int, Float[Tensor, "6"]], sequence: Sequence
+    rows: Iterable[TrackedPose], velocities: Mapping[int, Float[Tensor, "6"]], sequence: Sequence, delay: float = 0.0
 ) -> Iterator[PosedFrame]:
     """Withheld frames, each decoded when its turn comes, with depth brought to the instant of colour as in the run.
 
@@ -109,12 +109,15 @@ def withheld_views(
         rows: Which frames.
         velocities: Of `Trajectory.velocities`, by frame index.
         sequence: What they are read from.
+        delay: Of the depth images behind their stamps, as the run has learnt it; seconds.
 
     Raises:
         DatasetError: if one cannot be read.
     """
     for row in rows:
-        frame = synchronized(sequence.frame(row.frame_index), velocities[row.frame_index])
+        frame = sequence.frame(row.frame_index)
+        frame = replace(frame, depth_timestamp=frame.timestamp + frame.depth_delay + delay)
+        frame = synchronized(frame, velocities[row.frame_index])
         yield PosedFrame(frame, row.T_map_cam, withheld=True)
 
 
@@ -126,3 +129,9 @@ def velocities_by_frame(trajectory: Trajectory, atlas: Atlas) -> dict[int, Float
 def in_turn(*views: Iterator[PosedFrame]) -> Iterator[PosedFrame]:
     """Views of several kinds, each in the order of time, merged into one such order."""
     return heapq.merge(*views, key=lambda view: view.frame.index)
+
+
+def learnt_delay(run: RunDirectory) -> float:
+    """How late the run found its depth images to be, seconds; 0 where it does not say."""
+    delay = run.summary().get("depth_delay_ms", 0.0)
+    return 1e-3 * delay if isinstance(delay, int | float) else 0.0
