@@ -12,15 +12,16 @@ from tcgsplat.cli.usage import UsageError
 
 @dataclass(frozen=True)
 class Render:
-    """Time the CPU rasterizer, forward and backward, on random scenes of three sizes.
+    """Time an iteration of mapping on the CPU on random scenes of three sizes: forward, backward, Adam.
 
-    Colour, confidence and plane depth take part in the loss; derivatives go to all parameters and to the pose. Times
-    are medians in milliseconds. `autograd` is torch's share, `iteration` the whole. A second table counts what each
+    All seven channels (colour, confidence, depth, plane depth, alpha) have a derivative, which goes to all parameters
+    and to the pose; losses are not computed. Times are medians and minima in milliseconds. `iteration` is the whole,
+    in runs of its own: for the times of the stages, threads must meet between them. A second table counts what each
     scene needs and says which share of the time this machine could not do without: the physical limit.
     """
 
     json: Path | None = None
-    """File to write to: an object from size to numbers, stages as `forward_ms`, floors as `forward_floor_ms`."""
+    """File to write to: from size to numbers, by stage: `forward_ms`, `forward_min_ms`, `forward_floor_ms`."""
     repeats: int = 20
     """Timed iterations of each size, after three that are not."""
     threads: int | None = None
@@ -55,7 +56,7 @@ class Track:
 
 @dataclass(frozen=True)
 class Args:
-    """Time the rasterizer on random scenes, or the whole system on a recorded sequence."""
+    """Time the mapping's kernels on random scenes, or the whole system on a recorded sequence."""
 
     what: tyro.conf.OmitSubcommandPrefixes[
         tyro.conf.OmitArgPrefixes[

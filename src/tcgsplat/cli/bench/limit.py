@@ -1,4 +1,4 @@
-"""The physical limit of the rasterizer's stages: the least time in which this machine could do what a scene needs.
+"""The physical limit of mapping's stages: the least time in which this machine could do what a scene needs.
 
 Blending is bound by arithmetic. What it needs is counted on the very scene (`Needs`), in vectors of sixteen pixels,
 the 4 x 4 blocks that a splat's ellipse touches; each takes a known number of instructions of the multiply-add pipes:

@@ -1,0 +1,69 @@
+"""An iteration of mapping's optimisation as its kernels run it, once the loss has been differentiated by the images."""
+
+import numpy as np
+
+from tcgsplat.geometry.camera import Camera
+from tcgsplat.mapping import native_kernels as kernels
+from tcgsplat.render.numba_cpu.layout import CHANNELS, FEATURE, PARAMETERS, Floats, aligned
+from tcgsplat.render.numba_cpu.passes import Drawn, Passes, Workspace
+from tcgsplat.render.numba_cpu.phases import COUNTERS
+from tcgsplat.render.protocol import Splats
+from tcgsplat.scene.gaussians import SH_C0
+
+_FAINT = -60.0
+"""Logit of an opacity that no rasterizer draws."""
+
+
+class Iteration:
+    """The calls of `NativeOptimization.step` on any splats, but for the losses: the images' derivative is random.
+
+    Adam's learning rates are zero. It does all that it does otherwise, but each iteration meets the same scene.
+    """
+
+    def __init__(self, splats: Splats, camera: Camera, passes: Passes) -> None:
+        """Of splats with four features, three colours and a confidence, before a camera at the origin."""
+        n = len(splats.means)
+        self._camera, self._passes, self._space = camera, passes, Workspace()
+        self._padded = -(-n // 16) * 16
+        self.raw = _raw(splats, self._padded)
+        self.parameters: Floats = aligned((PARAMETERS, self._padded))  # type: ignore[assignment]
+        self.parameters[FEATURE + 3] = 0.0
+        self.parameters[FEATURE + 3, :n] = splats.features[:, 3].numpy()
+        kernels.activate(self.raw.reshape(-1), self.parameters.reshape(-1), self._padded, 0, self._padded)
+        self._before = self.raw.copy()
+        self.first, self.second = np.zeros_like(self.raw), np.zeros_like(self.raw)
+        self._clocks: Floats = np.ones((2, self._padded), np.float32)
+        self._allowed: Floats = np.full(self._padded, np.inf, np.float32)
+        self._scale: Floats = np.ones(self._padded, np.float32)
+        self._constants: Floats = np.zeros(kernels.CONSTANTS, np.float32)
+        self._excess: Floats = np.zeros(self._padded, np.float32)
+        generator = np.random.default_rng(1)
+        self._d_planes = generator.random((CHANNELS, camera.height, camera.width), np.float32)
+
+    def step(self) -> None:
+        """Draw, differentiate, and Adam for what was drawn."""
+        drawn = self.draw()
+        grads, _ = self._passes.differentiate(
+            drawn, self._d_planes, self._space.floats("grads", PARAMETERS, self._padded)
+        )
+        arrays = (
+            self._padded, self.raw.reshape(-1), self.parameters.reshape(-1), self._before.reshape(-1),
+            self.first.reshape(-1), self.second.reshape(-1), self._clocks.reshape(-1), grads.reshape(-1),
+            drawn.visible.astype(np.float32), self._allowed, self._scale, self._constants, self._excess,
+        )  # fmt: skip
+        self._passes.workers.share(kernels.adam_step, self._space.longs("progress", COUNTERS), lambda _: arrays)
+
+    def draw(self) -> Drawn:
+        """The forward pass alone."""
+        return self._passes.draw(self.parameters, self._camera, np.eye(4))
+
+
+def _raw(splats: Splats, padded: int) -> Floats:
+    """The parameters that are optimised, [ROWS, padded]; padding is too faint to be drawn."""
+    matrix: Floats = aligned((kernels.ROWS, padded))  # type: ignore[assignment]
+    matrix[:, len(splats.means) :] = 1.0
+    matrix[kernels.LOGIT, len(splats.means) :] = _FAINT
+    sh = (splats.features[:, None, :3] - 0.5) / SH_C0
+    tables = (splats.means, splats.quats, splats.scales.log(), splats.opacities.logit(), sh)
+    kernels.pack(*(np.ascontiguousarray(table.numpy()) for table in tables), matrix)
+    return matrix
