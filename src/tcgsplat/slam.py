@@ -80,8 +80,17 @@ class Reference:
 class Slam:
     """The whole online system; `step` it through the frames, then `finish`."""
 
-    def __init__(self, config: SlamConfig, rasterizer: Rasterizer) -> None:
+    def __init__(self, config: SlamConfig, rasterizer: Rasterizer, *, live: bool = False) -> None:
+        """A system that has seen nothing yet.
+
+        Args:
+            config: All settings.
+            rasterizer: Backend of tracking and mapping.
+            live: Never wait for the map: it comes into use when it is ready, and nothing new is mapped before. For a
+                camera that does not wait either; what comes out then depends on the machine's speed.
+        """
         self.config = config
+        self._live = live
         self._device = rasterizer.device
         generator = torch.Generator().manual_seed(config.seed)
         self._tracker = Tracker(config.tracker, config.confidence, rasterizer)
@@ -105,12 +114,12 @@ class Slam:
         self._since_mapped += 1
 
         # The map that was optimised meanwhile comes into use, after as many frames on a slow machine as on a fast one.
-        update = self._finished_update() if self._schedule.adopts(self._since_mapped) else None
+        ready = not self._updates if self._live else self._schedule.adopts(self._since_mapped)
+        update = self._finished_update() if ready else None
         clock.lap("wait")
 
         # Track: the map stands still, only the camera moves (equations 17 to 19).
-        velocity = self.motion.steady
-        applied = velocity * self.delay.seconds
+        velocity, stamped = self.motion.steady, frame.depth_delay
         frame = self.delay.corrected(frame) if self._learns_delay else frame
         together = synchronized(frame, velocity) if self._synchronizes else frame
         tracked = self._tracked(together, guess=self.motion.predict(frame.timestamp))
@@ -118,11 +127,15 @@ class Slam:
         advance = self.motion.advanced if tracked.converged else self.motion.coasted
         self.motion = advance(T_map_cam, frame.timestamp)
         if self._learns_delay and tracked.converged and tracked.color and tracked.depth:
-            self.delay = self.delay.observed(self.motion.steady.numpy(), applied.numpy(), tracked.color, tracked.depth)
+            moved = (frame.depth_delay if together is not frame else 0.0) - stamped
+            applied = (velocity * moved).numpy()
+            self.delay = self.delay.observed(self.motion.steady.numpy(), applied, tracked.color, tracked.depth)
         clock.lap("track")
 
         # Switch: seal the submap and anchor the next one at this camera (equation 16).
-        if tracked.converged and self._schedule.switches_submap(frame.index, T_map_cam, self.submap):
+        may_map = tracked.converged and not (self._live and self._updates)
+        begins = bool((frame.valid & (frame.depth > 0)).any())  # a submap needs a surface to begin with
+        if may_map and begins and self._schedule.switches_submap(frame.index, T_map_cam, self.submap):
             update = self._finished_update() or update
             clock.lap("wait")
             sealed = self.submap.sealed(self.config.confidence)
@@ -132,18 +145,18 @@ class Slam:
             self.motion, T_map_cam = self.motion.rebased(), se3.identity()
 
         # Map: grow where the view is new, and have it all optimised and judged while the next frames are tracked.
-        maps = tracked.converged and self._schedule.maps(self._since_mapped, self.submap)
+        maps = may_map and self._schedule.maps(self._since_mapped, self.submap)
         if maps:
             update = self._finished_update() or update
             clock.lap("wait")
             together = synchronized(frame, self.motion.steady) if self._synchronizes else frame
             grown = self._mapper.grown(together, T_map_cam, self.submap)
             self.submap, self._since_mapped = grown.submap, 0
-            if not (grown.first and len(self._reference.submap)):
-                self._reference = Reference(self.submap)
+            if not grown.first or not len(self._reference.submap):
+                self._refer_to(self.submap)
             self._updating = self._mapping_thread.submit(self._updated, grown)
             clock.lap("grow")
-            if self.config.schedule.map_lag == 0:
+            if self.config.schedule.map_lag == 0 and not self._live:
                 update = self._finished_update()
                 clock.lap("wait")
 
@@ -181,13 +194,24 @@ class Slam:
         seconds = time.perf_counter() - started
         return submap, MapUpdate(grown.frame.index, grown.seeded, mapped.pruned, mapped.loss, seconds)
 
+    @property
+    def _updates(self) -> bool:
+        """Whether a mapping update is being worked on."""
+        return self._updating is not None and not self._updating.done()
+
     def _finished_update(self) -> MapUpdate | None:
         """Wait for the update that is under way, if any, and use its map from now on."""
         if self._updating is None:
             return None
         self.submap, update = self._updating.result()
-        self._reference, self._updating = Reference(self.submap), None
+        self._updating = None
+        self._refer_to(self.submap)
         return update
+
+    def _refer_to(self, submap: Submap) -> None:
+        """Track against the active submap from now on, if there is anything in it."""
+        if len(submap):
+            self._reference = Reference(submap)
 
     def _anchored(self, T_world_map: torch.Tensor, index: int) -> Submap:
         return Submap.anchored(T_world_map, index, self.config.mapper.sh_degree, self._device)

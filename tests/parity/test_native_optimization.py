@@ -142,12 +142,24 @@ def test_a_nan_in_a_picture_does_not_reach_the_map(submap: Submap) -> None:
             assert bool(getattr(optimization.submap().gaussians, name).isfinite().all())
 
 
-def test_settings_that_only_autograd_knows_are_left_to_it() -> None:
-    assert covers(MapperConfig(), CONFIDENCE)
-    assert not covers(MapperConfig(sh_degree=1), CONFIDENCE)
-    assert not covers(MapperConfig(isotropy_weight=1.0), CONFIDENCE)
-    assert not covers(MapperConfig(frozen_color_share=0.5), CONFIDENCE)
-    assert not covers(MapperConfig(), replace(CONFIDENCE, step_scale_mode="gradient"))
+def test_what_only_autograd_knows_is_left_to_it(submap: Submap) -> None:
+    assert covers(submap, MapperConfig(), CONFIDENCE)
+    assert not covers(submap, MapperConfig(sh_degree=1), CONFIDENCE)
+    assert not covers(submap, MapperConfig(isotropy_weight=1.0), CONFIDENCE)
+    assert not covers(submap, MapperConfig(frozen_color_share=0.5), CONFIDENCE)
+    assert not covers(submap, MapperConfig(), replace(CONFIDENCE, step_scale_mode="gradient"))
+    keyframe = submap.keyframes[0]
+    narrow = replace(keyframe, frame=replace(keyframe.frame, camera=replace(keyframe.frame.camera, width=15)))
+    assert not covers(replace(submap, keyframes=(narrow,)), MapperConfig(), CONFIDENCE)
+
+
+def test_asking_how_far_they_went_does_not_change_the_loss(submap: Submap) -> None:
+    optimization = NativeOptimization(submap, MapperConfig(), GUIDANCE["mean"], RASTERIZER.passes)
+    for view in (0, 1):
+        optimization.step(view)
+    loss = optimization.loss
+    optimization.self_distance()
+    assert optimization.loss == loss
 
 
 def test_a_width_that_is_no_multiple_of_sixteen(submap: Submap) -> None:

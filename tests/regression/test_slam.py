@@ -125,6 +125,40 @@ class TestLag:
         assert not slam.step(SEQUENCE.frame(1)).tracked.lost
 
 
+class TestReference:
+    @pytest.mark.parametrize("blind", [1, 2, 3])
+    def test_frames_without_depth_where_a_submap_would_begin(
+        self, blind: int, walked: Run, rasterizer: Rasterizer
+    ) -> None:
+        """Colour alone still tracks, and the new submap waits for a surface."""
+        begins = next(report.frame_index for report in walked.reports if report.sealed)
+
+        def frames() -> Iterator[Frame]:
+            for frame in SEQUENCE:
+                gone = begins <= frame.index < begins + blind
+                yield replace(frame, depth=torch.zeros_like(frame.depth)) if gone else frame
+
+        result = run(frames(), rasterizer)
+        assert not any(report.tracked.iterations == 0 for report in result.reports[1:])
+        for T, true in zip(result.T_world_cam, SEQUENCE.T_world_cam, strict=True):
+            assert errors(T, true)[0] < 15
+
+
+class TestLive:
+    def test_a_live_system_never_waits_for_the_map(self, rasterizer: Rasterizer) -> None:
+        """Whatever its speed, one update is worked on at a time, and none is lost."""
+        slam = Slam(CONFIG, rasterizer, live=True)
+        reports = [slam.step(frame) for frame in SEQUENCE]
+        slam.finish()
+        assert all(report.seconds["wait"] < 0.005 for report in reports)
+        begun = [report.frame_index for report in reports if report.mapped]
+        used = [report.update.frame_index for report in reports if report.update]
+        assert begun[: len(used)] == used and len(used) >= len(begun) - 1
+        assert len(begun) >= 2
+        off = [errors(T, true) for T, true in zip(slam.trajectory.world(slam.atlas), SEQUENCE.T_world_cam, strict=True)]
+        assert max(millimetres for millimetres, _ in off) < 20
+
+
 class TestSubmaps:
     def test_each_is_sealed_once_and_in_order(self, walked: Run) -> None:
         assert len(walked.submaps) >= 3

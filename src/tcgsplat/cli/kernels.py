@@ -13,6 +13,7 @@ from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.frame import Frame
 from tcgsplat.slam import Slam
+from tcgsplat.tracking.synchronization import synchronized
 
 _ONE_STEP: Final = {
     "tracker.descent.iterations": 1,
@@ -38,6 +39,8 @@ def compile_kernels(config: SlamConfig, rasterizer: Rasterizer, announce: Callab
     with _heard_compiling(announce):
         for index in range(2):
             slam.step(_wall(index))
+        synchronized(_wall(2), torch.full((6,), 0.5, dtype=torch.float64))  # the wall stands still, so no step did
+        slam.finish()
     return time.perf_counter() - started
 
 
@@ -49,6 +52,7 @@ def _wall(index: int) -> Frame:
     return Frame(
         index=index,
         timestamp=index / 30,
+        depth_timestamp=index / 30 + 0.01,
         color=shade[..., None].repeat(1, 1, 3),
         depth=torch.full((height, width), 1.5),
         valid=torch.ones(height, width, dtype=torch.bool),

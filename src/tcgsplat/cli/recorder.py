@@ -121,7 +121,7 @@ def recorded(
             # `stop.wait`, so that nobody has to wait for the camera's next frame when the run is to stop
             closing(play(sequence, Clock(sleep=stop.wait)) if realtime else in_turn(sequence)) as arrivals,
         ):
-            summary = record(Slam(config, rasterizer), arrivals, run, progress.observe, stop.is_set)
+            summary = record(Slam(config, rasterizer, live=realtime), arrivals, run, progress.observe, stop.is_set)
     except KeyboardInterrupt as interrupt:
         saved = f"{run.submap_count} submaps sealed before are saved"
         raise KeyboardInterrupt(f"stopped at once; {saved}: {run.path}") from interrupt

@@ -12,14 +12,14 @@ class Args:
     """Optimise a run's map further over its keyframes, which hold their pictures: the recording is not needed.
 
     Poses and confidence stay; the map gets sharper. Every submap's file is replaced by the refined one when that is
-    complete, so that Ctrl-C leaves a whole run. Work is shared between submaps by their numbers of keyframes. Time
-    decides how far --seconds gets; --steps gives the same bits every time.
+    complete, so that Ctrl-C leaves a whole run. Every submap gets the same share of the time. How far --seconds
+    gets depends on the machine; --steps gives the same bits every time. Score and export the run again afterwards.
     """
 
     run: tyro.conf.Positional[Path]
     """The run directory; its submaps are replaced."""
     seconds: float = 60.0
-    """Wall time for all submaps together."""
+    """Of optimising, for all submaps together; reading and writing their files comes on top."""
     steps: int | None = None
     """So many optimisation steps a keyframe, instead of a time."""
     backend: str = "auto"
@@ -45,15 +45,14 @@ def command(args: Args) -> int:
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     torch.set_num_threads(1)  # as in a run: the kernels have threads of their own
     compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some ten seconds"))
-    keyframes = [len(run.load_submap(index).keyframes) for index in range(run.submap_count)]
-    generator = torch.Generator().manual_seed(config.seed)
+    generator, submaps = torch.Generator().manual_seed(config.seed), run.submap_count
     with counting("submap") as tell:
-        for index, count in enumerate(keyframes):
-            tell(index, len(keyframes))
-            share = count / max(sum(keyframes), 1)
-            progress = for_seconds(args.seconds * share) if args.steps is None else for_steps(args.steps * count)
+        for index in range(submaps):
+            tell(index, submaps)
             submap = run.load_submap(index)
+            steps = None if args.steps is None else args.steps * len(submap.keyframes)
+            progress = for_seconds(args.seconds / submaps) if steps is None else for_steps(steps)
             run.write_submap(refined(submap, config.mapper, config.confidence, rasterizer, generator, progress))
     effort = f"{args.seconds:g} s" if args.steps is None else f"{args.steps} steps a keyframe"
-    sys.stdout.write(f"{len(keyframes)} submaps refined by {effort}: {run.path}\n")
+    sys.stdout.write(f"{submaps} submaps refined by {effort}: {run.path}\n")
     return 0

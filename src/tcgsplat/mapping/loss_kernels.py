@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from tcgsplat.render import ssim_kernels
+from tcgsplat.render.numba_cpu.compilation import kept
 from tcgsplat.render.numba_cpu.phases import WAITING, next_unit
 from tcgsplat.render.numba_cpu.simd import INNER, KERNEL, fma, load, maximum, spread, store, sum_lanes, where_ge
 
@@ -36,7 +37,7 @@ _MIN_ALPHA = np.float32(1e-3)
 """As `Rendering.depth_as` has it."""
 
 
-@njit(**INNER)
+@kept(njit(**INNER))
 def _across(lines, maps, width, window, out, plane, at):  # type: ignore[no-untyped-def]
     """The window along a row: line m, with its margins, goes to `out[m * plane + at:]`."""
     pitch = width + 2 * MARGIN
@@ -50,7 +51,7 @@ def _across(lines, maps, width, window, out, plane, at):  # type: ignore[no-unty
             store(out, m * plane + at + x, total)
 
 
-@njit(**INNER)
+@kept(njit(**INNER))
 def _down(rows, y, height, width, at, window):  # type: ignore[no-untyped-def]
     """The window along columns: sixteen pixels of row y, the first of which is at `at`."""
     total = load(rows, at) * window[RADIUS]
@@ -63,14 +64,14 @@ def _down(rows, y, height, width, at, window):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(**INNER)
+@kept(njit(**INNER))
 def _shown(planes, color, valid, plane, pixel, channel):  # type: ignore[no-untyped-def]
     """Rendered colour; where the picture saw nothing, the picture's own, so that no window sees a false edge."""
     at = channel * plane + pixel
     return where_ge(load(valid, pixel), spread(_ONE), load(planes, at), load(color, at))
 
 
-@njit(**INNER)
+@kept(njit(**INNER))
 def _average_across(y, width, plane, planes, color, valid, window, lines, rows):  # type: ignore[no-untyped-def]
     """Phase ACROSS for one row: the five images of every channel."""
     pitch = width + 2 * MARGIN
@@ -87,7 +88,7 @@ def _average_across(y, width, plane, planes, color, valid, window, lines, rows):
         _across(lines, 5, width, window, rows, 3 * plane, c * plane + y * width)
 
 
-@njit(**INNER)
+@kept(njit(**INNER))
 def _similarity(y, height, width, plane, rows, window, lanes, constants, partials):  # type: ignore[no-untyped-def]
     """Phase DOWN for one row: the loss's derivative by m_a, E[aa] and E[ab]; gives the sum of S."""
     total = spread(_ZERO)
@@ -114,7 +115,7 @@ def _similarity(y, height, width, plane, rows, window, lanes, constants, partial
     return sum_lanes(total)
 
 
-@njit(**INNER)
+@kept(njit(**INNER))
 def _partials_across(y, width, plane, partials, window, lines, rows):  # type: ignore[no-untyped-def]
     """Phase ACROSS_BACK for one row."""
     pitch = width + 2 * MARGIN
@@ -126,7 +127,7 @@ def _partials_across(y, width, plane, partials, window, lines, rows):  # type: i
         _across(lines, 3, width, window, rows, 3 * plane, c * plane + y * width)
 
 
-@njit(**INNER)
+@kept(njit(**INNER))
 def _pixels(
     y, height, width, plane, planes, color, depth, valid, rows, window, lanes, constants, d_planes
 ):  # type: ignore[no-untyped-def]  # fmt: skip
@@ -171,7 +172,7 @@ def _pixels(
     return sum_lanes(total)
 
 
-@njit(**KERNEL)
+@kept(njit(**KERNEL))
 def differentiate_losses(
     progress, width, height, planes, color, depth, valid, window, lanes, constants, lines, rows, partials, d_planes,
     sums,

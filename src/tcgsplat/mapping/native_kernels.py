@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from tcgsplat.mapping.optimizer import BETA_1, BETA_2, EPSILON
+from tcgsplat.render.numba_cpu.compilation import kept
 from tcgsplat.render.numba_cpu.layout import FEATURE, LOG2_OPACITY, MEAN, QUAT, SCALE
 from tcgsplat.render.numba_cpu.phases import WAITING, next_unit
 from tcgsplat.render.numba_cpu.simd import (
@@ -54,7 +55,7 @@ _REST_1, _REST_2 = np.float32(1 - BETA_1), np.float32(1 - BETA_2)
 _TINY = np.float32(1e-24)
 
 
-@njit(**KERNEL)
+@kept(njit(**KERNEL))
 def activate(raw, P, n, start, stop):
     """The rasterizer's parameters from raw ones, for a range: what `Gaussians` calls scales, opacities and colors."""
     for i in range(start, stop, 16):
@@ -69,7 +70,7 @@ def activate(raw, P, n, start, stop):
             store(P, row * n + i, maximum(fma(load(raw, row * n + i), spread(_C0), spread(_HALF)), spread(_ZERO)))
 
 
-@njit(**INNER)
+@kept(njit(**INNER))
 def _changes(raw, before, n, i):
     """Of sixteen Gaussians: d_mu (Eq. 5), d_s (Eq. 6), the cosine between quaternions, and their inverse lengths."""
     one, moved, stretched = spread(_ONE), spread(_ZERO), spread(_ZERO)
@@ -86,14 +87,14 @@ def _changes(raw, before, n, i):
     return sqrt(moved), sqrt(stretched), product * inverse * inverse_before, inverse, inverse_before
 
 
-@njit(**INNER)
+@kept(njit(**INNER))
 def _distance(moved, stretched, cosine, constants):
     """Eq. 8."""
     turned = maximum(spread(_ONE) - cosine * cosine, spread(_ZERO))
     return fma(turned, spread(constants[ROTATION_WEIGHT]), fma(stretched, spread(constants[SCALE_WEIGHT]), moved))
 
 
-@njit(**KERNEL)
+@kept(njit(**KERNEL))
 def self_distances(raw, before, n, constants, out):
     """How far each Gaussian is from where it was before the update (Eq. 8), metres."""
     for i in range(0, n, 16):
@@ -101,7 +102,7 @@ def self_distances(raw, before, n, constants, out):
         store(out, i, _distance(moved, stretched, cosine, constants))
 
 
-@njit(**INNER)
+@kept(njit(**INNER))
 def _adam_step(n, start, stop, raw, P, before, first, second, clocks, grads, visible, allowed, scale, constants, excess):
     """One Adam step of the visible Gaussians of a range, on the losses of the pixels and of Eq. 23.
 
@@ -159,7 +160,7 @@ def _adam_step(n, start, stop, raw, P, before, first, second, clocks, grads, vis
         activate(raw, P, n, i, i + 16)
 
 
-@njit(**KERNEL)
+@kept(njit(**KERNEL))
 def adam_step(
     progress, n, raw, P, before, first, second, clocks, grads, visible, allowed, scale, constants, excess
 ):
@@ -175,7 +176,7 @@ def adam_step(
     return k != WAITING
 
 
-@njit(**KERNEL)
+@kept(njit(**KERNEL))
 def pack(means, quats, log_scales, logits, sh, matrix):
     """Tables of parameters to the rows of a matrix."""
     for i in range(means.shape[0]):
@@ -188,7 +189,7 @@ def pack(means, quats, log_scales, logits, sh, matrix):
         matrix[LOGIT, i] = logits[i]
 
 
-@njit(**KERNEL)
+@kept(njit(**KERNEL))
 def unpack(matrix, rows, means, quats, log_scales, logits, sh):
     """The matrix' columns named by `rows`, back to tables."""
     for j in range(rows.size):

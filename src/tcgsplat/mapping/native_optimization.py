@@ -26,10 +26,12 @@ _FAINT = -60.0
 _LANES: Floats = np.arange(16, dtype=np.float32)
 
 
-def covers(config: MapperConfig, confidence: ConfidenceConfig) -> bool:
-    """Whether the kernels know what these settings ask for."""
+def covers(submap: Submap, config: MapperConfig, confidence: ConfidenceConfig) -> bool:
+    """Whether the kernels know what these settings and pictures ask for."""
     literal = confidence.guide_mapping and confidence.step_scale_mode == "gradient"
-    return config.sh_degree == 0 and config.isotropy_weight == 0 and config.frozen_color_share == 0 and not literal
+    plain = config.sh_degree == 0 and config.isotropy_weight == 0 and config.frozen_color_share == 0
+    wide = all(keyframe.frame.camera.width >= loss_kernels.MIN_WIDTH for keyframe in submap.keyframes)
+    return plain and wide and not literal
 
 
 class _View:
@@ -55,17 +57,18 @@ class NativeOptimization:
         n = len(submap)
         self._padded = -(-max(n, 1) // 16) * 16
         self._raw = _matrix(submap.gaussians, self._padded)
-        self._before = self._raw.copy()
+        self._before = _aligned_copy(self._raw)
         self._parameters: Floats = aligned((PARAMETERS, self._padded))  # type: ignore[assignment]
         self._parameters[FEATURE + 3] = 0.0
         self._parameters[FEATURE + 3, :n] = submap.confidence.value.numpy()
         kernels.activate(_flat(self._raw), _flat(self._parameters), self._padded, 0, self._padded)
-        self._first, self._second = np.zeros_like(self._raw), np.zeros_like(self._raw)
-        self._clocks: Floats = np.ones((2, self._padded), np.float32)
+        self._first, self._second = (_filled(0.0, *self._raw.shape) for _ in range(2))
+        self._clocks = _filled(1.0, 2, self._padded)
         self._counted = self._row(0.0, self._has_history())
         self._allowed = self._row(np.inf, self._allowed_distance())
         self._scale = self._row(1.0, self._step_scale())
-        self._excess: Floats = np.zeros(self._padded, np.float32)
+        self._excess = _filled(0.0, self._padded)
+        self._visible = _filled(0.0, self._padded)
         self._rates = _rates(config)
         self._window = ssim_window().numpy()
         self._space = Workspace()
@@ -77,11 +80,12 @@ class NativeOptimization:
         drawn = self._passes.draw(self._parameters, target.camera, target.T_cam_map)
         d_planes = self._differentiated_losses(target, drawn.planes)
         grads, _ = self._passes.differentiate(drawn, d_planes, self._space.floats("grads", PARAMETERS, self._padded))
-        visible = drawn.visible.astype(np.float32)
+        self._visible[:] = drawn.visible
+        self._stability_weight = self._confidence.stability_weight / self._count()
         arrays = (
             self._padded, _flat(self._raw), _flat(self._parameters), _flat(self._before), _flat(self._first),
-            _flat(self._second), _flat(self._clocks), _flat(grads), visible, self._allowed, self._scale,
-            self._constants(visible, pace), self._excess,
+            _flat(self._second), _flat(self._clocks), _flat(grads), self._visible, self._allowed, self._scale,
+            self._constants(pace), self._excess,
         )  # fmt: skip
         self._share(kernels.adam_step, 1, lambda _: arrays)
 
@@ -105,8 +109,7 @@ class NativeOptimization:
     def self_distance(self) -> PerGaussian:
         """See `Optimization`."""
         distances: Floats = aligned(self._padded)  # type: ignore[assignment]
-        constants = self._constants(np.zeros(self._padded, np.float32), 1.0)
-        kernels.self_distances(_flat(self._raw), _flat(self._before), self._padded, constants, distances)
+        kernels.self_distances(_flat(self._raw), _flat(self._before), self._padded, self._constants(1.0), distances)
         return torch.from_numpy(distances[self._survivors()])
 
     def _survivors(self) -> npt.NDArray[np.int64]:
@@ -157,7 +160,7 @@ class NativeOptimization:
 
     def _row(self, padding: float, values: torch.Tensor | None) -> Floats:
         """A value for each Gaussian, padded; all padding where there are none."""
-        row: Floats = np.full(self._padded, padding, np.float32)
+        row = _filled(padding, self._padded)
         if values is not None:
             row[: len(values)] = values.numpy()
         return row
@@ -188,16 +191,32 @@ class NativeOptimization:
             p_min=config.p_min,
         )
 
-    def _constants(self, visible: Floats, pace: float) -> Floats:
+    def _count(self) -> float:
+        """What Eq. 23 divides by."""
+        mean = self._confidence.stability_reduction == "mean"
+        return max(float(self._visible @ self._counted), 1.0) if mean else 1.0
+
+    def _constants(self, pace: float) -> Floats:
         config = self._confidence
-        counted = max(float(visible @ self._counted), 1.0) if config.stability_reduction == "mean" else 1.0
-        self._stability_weight = config.stability_weight / counted
         weights = [config.scale_change_weight, config.rotation_change_weight, self._stability_weight]
         return np.concatenate((np.float32(pace) * self._rates, np.array(weights, np.float32)))
 
 
 def _flat(matrix: Floats) -> Floats:
     return matrix.reshape(-1)
+
+
+def _filled(value: float, *shape: int) -> Floats:
+    """An array whose vectors do not straddle cache lines: an unaligned one takes Adam half as long again."""
+    array: Floats = aligned(shape)  # type: ignore[assignment]
+    array[...] = value
+    return array
+
+
+def _aligned_copy(matrix: Floats) -> Floats:
+    copy = _filled(0.0, *matrix.shape)
+    copy[:] = matrix
+    return copy
 
 
 def _rates(config: MapperConfig) -> Floats:

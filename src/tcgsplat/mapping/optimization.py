@@ -58,7 +58,7 @@ def begin(submap: Submap, config: MapperConfig, confidence: ConfidenceConfig, ra
         from tcgsplat.mapping.native_optimization import NativeOptimization, covers  # noqa: PLC0415
         from tcgsplat.render.numba_cpu import NumbaRasterizer  # noqa: PLC0415
 
-        if isinstance(rasterizer, NumbaRasterizer) and covers(config, confidence):
+        if isinstance(rasterizer, NumbaRasterizer) and covers(submap, config, confidence):
             return NativeOptimization(submap, config, confidence, rasterizer.passes)
     return AutogradOptimization(submap, config, confidence, rasterizer)
 

@@ -9,8 +9,8 @@
       summary.json       at the end only: frames, seconds, peak_rss_mb, stage_ms, ...
       report.json, contact_sheet.png, trajectory.png    written by the evaluation
 
-Every file is complete or absent. A submap's file is written before the trajectory that speaks of it, and never again:
-loop closure moves submaps by `trajectory.npz` alone.
+Every file is complete or absent. A submap's file is written before the trajectory that speaks of it, and again by
+`refine` only: loop closure moves submaps by `trajectory.npz` alone.
 """
 
 import json

@@ -7,6 +7,7 @@ without a reading by 0.
 import numpy as np
 from numba import njit
 
+from tcgsplat.render.numba_cpu.compilation import kept
 from tcgsplat.render.numba_cpu.simd import (
     LANES,
     MATH,
@@ -71,7 +72,7 @@ _BASE = np.float32(0.4)
 _RED, _GREEN, _BLUE = np.float32(0.299), np.float32(0.587), np.float32(0.114)
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
+@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True))
 def luma(color):
     """Intensity [h, w] of an RGB image [h, w, 3]."""
     h, w = color.shape[:2]
@@ -82,7 +83,7 @@ def luma(color):
     return intensity
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@kept(njit(error_model="numpy", nogil=True, cache=True))
 def live_view(color, depth, valid):
     """Intensity and marked depth of a frame: what is not valid saw nothing."""
     h, w = depth.shape
@@ -93,7 +94,7 @@ def live_view(color, depth, valid):
     return intensity, marked
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
+@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True))
 def rendered_view(color, depth, alpha, min_alpha):
     """Intensity and marked depth of images that are multiplied by alpha: what is hardly covered saw nothing.
 
@@ -109,7 +110,7 @@ def rendered_view(color, depth, alpha, min_alpha):
     return intensity, marked
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@kept(njit(error_model="numpy", nogil=True, cache=True))
 def halved_intensity(image):
     """Mean over two by two pixels."""
     h, w = image.shape[0] // 2, image.shape[1] // 2
@@ -122,7 +123,7 @@ def halved_intensity(image):
     return out
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@kept(njit(error_model="numpy", nogil=True, cache=True))
 def halved_depth(depth):
     """Mean of the readings of two by two pixels that agree with the nearest one; -1 if any saw nothing."""
     h, w = depth.shape[0] // 2, depth.shape[1] // 2
@@ -148,7 +149,7 @@ def halved_depth(depth):
     return out
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@kept(njit(error_model="numpy", nogil=True, cache=True))
 def live_image(intensity, depth):
     """What a pass samples, [h, w, CHANNELS]; slopes are central differences. The border stays empty: no pass asks."""
     h, w = intensity.shape
@@ -162,12 +163,12 @@ def live_image(intensity, depth):
     return out
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always")
+@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always"))
 def _apart(a, b):
     return maximum(a - b, b - a)
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
+@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True))
 def reference_points(intensity, depth, weight, intrinsics, radius, stride):
     """Points of a rendered view [POINT, n] in its camera frame, every `stride` pixels; normals from depth differences.
 
@@ -221,7 +222,7 @@ def reference_points(intensity, depth, weight, intrinsics, radius, stride):
     return points
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always")
+@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always"))
 def _mixed(squares, channel, w00, w10, w01, w11):
     """One channel of four pixels, interpolated."""
     return (
@@ -230,12 +231,12 @@ def _mixed(squares, channel, w00, w10, w01, w11):
     )  # fmt: skip
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always")
+@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always"))
 def _add(sums, entry, value):
     store(sums, entry * LANES, load(sums, entry * LANES) + value)
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always")
+@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always"))
 def _add_residual(sums, weight, r, j):
     """One weighted residual of every lane into the normal equations."""
     entry = HESSIAN
@@ -247,7 +248,7 @@ def _add_residual(sums, weight, r, j):
             entry += 1
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
+@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True))
 def normal_equations(points, live, constants):
     """One Gauss-Newton pass over the reference points: the SUMS, float64.
 

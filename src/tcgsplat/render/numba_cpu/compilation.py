@@ -10,13 +10,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tcgsplat.render import protocol
-
 
 def _digest() -> str:
-    """Of this folder's sources, and of the constants that all backends share."""
-    sources = [*sorted(Path(__file__).parent.glob("*.py")), Path(protocol.__file__)]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in sources if path.exists())).hexdigest()
+    """Of this folder's sources, of the kernels of other packages, and of where they have constants from."""
+    package = Path(__file__).parents[2]
+    patterns = (
+        "render/numba_cpu/*.py",
+        "*/*_kernels.py",
+        "render/protocol.py",
+        "mapping/optimizer.py",
+        "scene/gaussians.py",
+    )
+    sources = sorted(path for pattern in patterns for path in package.glob(pattern))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
 
 _SOURCES = _digest()
