@@ -38,11 +38,22 @@ def test_kernels_are_kept_until_a_source_changes(tmp_path: Path, monkeypatch: py
     assert not compiled_anew(path)
 
 
-def test_every_source_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "a.py").write_text("one = 1")
-    monkeypatch.setattr(compilation, "__file__", str(tmp_path / "compilation.py"))
-    before = compilation._digest()
-    (tmp_path / "b.py").write_text("two = 2")
-    between = compilation._digest()
-    (tmp_path / "a.py").write_text("one = 3")
-    assert len({before, between, compilation._digest()}) == 3
+@pytest.mark.parametrize(
+    "source",
+    [
+        "render/numba_cpu/simd.py",
+        "render/protocol.py",
+        "mapping/loss_kernels.py",
+        "mapping/optimizer.py",
+        "tracking/alignment_kernels.py",
+    ],
+)
+def test_every_source_counts(source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    file = tmp_path / source
+    file.parent.mkdir(parents=True)
+    monkeypatch.setattr(compilation, "__file__", str(tmp_path / "render" / "numba_cpu" / "compilation.py"))
+    digests = [compilation._digest()]
+    for text in ("one = 1", "one = 2"):
+        file.write_text(text)
+        digests.append(compilation._digest())
+    assert len(set(digests)) == 3
