@@ -91,7 +91,7 @@ class Slam:
         """
         self.config = config
         self._live = live
-        self._device = rasterizer.device
+        self._device, self._core = rasterizer.device, rasterizer.reserved
         generator = torch.Generator().manual_seed(config.seed)
         self._tracker = Tracker(config.tracker, config.confidence, rasterizer)
         self._mapper = Mapper(config.mapper, config.confidence, rasterizer, IdSource(), generator)
@@ -121,8 +121,9 @@ class Slam:
         # Track: the map stands still, only the camera moves (equations 17 to 19).
         velocity, stamped = self.motion.steady, frame.depth_delay
         frame = self.delay.corrected(frame) if self._learns_delay else frame
-        together = synchronized(frame, velocity) if self._synchronizes else frame
-        tracked = self._tracked(together, guess=self.motion.predict(frame.timestamp))
+        with self._core():
+            together = synchronized(frame, velocity) if self._synchronizes else frame
+            tracked = self._tracked(together, guess=self.motion.predict(frame.timestamp))
         T_map_cam = tracked.T_map_cam
         advance = self.motion.advanced if tracked.converged else self.motion.coasted
         self.motion = advance(T_map_cam, frame.timestamp)
@@ -149,8 +150,9 @@ class Slam:
         if maps:
             update = self._finished_update() or update
             clock.lap("wait")
-            together = synchronized(frame, self.motion.steady) if self._synchronizes else frame
-            grown = self._mapper.grown(together, T_map_cam, self.submap)
+            with self._core():
+                together = synchronized(frame, self.motion.steady) if self._synchronizes else frame
+                grown = self._mapper.grown(together, T_map_cam, self.submap)
             self.submap, self._since_mapped = grown.submap, 0
             if not grown.first or not len(self._reference.submap):
                 self._refer_to(self.submap)

@@ -57,18 +57,19 @@ class NativeOptimization:
         n = len(submap)
         self._padded = -(-max(n, 1) // 16) * 16
         self._raw = _matrix(submap.gaussians, self._padded)
-        self._before = _aligned_copy(self._raw)
+        self._before = filled(0.0, *self._raw.shape)
+        self._before[:] = self._raw
         self._parameters: Floats = aligned((PARAMETERS, self._padded))  # type: ignore[assignment]
         self._parameters[FEATURE + 3] = 0.0
         self._parameters[FEATURE + 3, :n] = submap.confidence.value.numpy()
         kernels.activate(_flat(self._raw), _flat(self._parameters), self._padded, 0, self._padded)
-        self._first, self._second = (_filled(0.0, *self._raw.shape) for _ in range(2))
-        self._clocks = _filled(1.0, 2, self._padded)
+        self._first, self._second = (filled(0.0, *self._raw.shape) for _ in range(2))
+        self._clocks = filled(1.0, 2, self._padded)
         self._counted = self._row(0.0, self._has_history())
         self._allowed = self._row(np.inf, self._allowed_distance())
         self._scale = self._row(1.0, self._step_scale())
-        self._excess = _filled(0.0, self._padded)
-        self._visible = _filled(0.0, self._padded)
+        self._excess = filled(0.0, self._padded)
+        self._visible = filled(0.0, self._padded)
         self._rates = _rates(config)
         self._window = ssim_window().numpy()
         self._space = Workspace()
@@ -160,7 +161,7 @@ class NativeOptimization:
 
     def _row(self, padding: float, values: torch.Tensor | None) -> Floats:
         """A value for each Gaussian, padded; all padding where there are none."""
-        row = _filled(padding, self._padded)
+        row = filled(padding, self._padded)
         if values is not None:
             row[: len(values)] = values.numpy()
         return row
@@ -206,17 +207,11 @@ def _flat(matrix: Floats) -> Floats:
     return matrix.reshape(-1)
 
 
-def _filled(value: float, *shape: int) -> Floats:
+def filled(value: float, *shape: int) -> Floats:
     """An array whose vectors do not straddle cache lines: an unaligned one takes Adam half as long again."""
     array: Floats = aligned(shape)  # type: ignore[assignment]
     array[...] = value
     return array
-
-
-def _aligned_copy(matrix: Floats) -> Floats:
-    copy = _filled(0.0, *matrix.shape)
-    copy[:] = matrix
-    return copy
 
 
 def _rates(config: MapperConfig) -> Floats:

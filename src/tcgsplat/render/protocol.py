@@ -6,6 +6,7 @@ with alpha of Eq. 3 evaluated at pixel centres (integer coordinates), splats in 
 Nothing is divided by alpha here.
 """
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -75,4 +76,8 @@ class Rasterizer(Protocol):
 
     def __call__(self, splats: Splats, camera: Camera, T_cam_map: Pose) -> Raster:
         """Draw splats as the camera at `T_cam_map` (map frame to camera frame) sees them."""
+        ...
+
+    def reserved(self) -> AbstractContextManager[None]:
+        """A core for the calling thread while inside; other threads that draw share the rest among them."""
         ...

@@ -4,6 +4,7 @@ Every pixel meets every splat. Works in float32 and float64, so that `gradcheck`
 autograd's. Faster backends are held to this file by tests, forward and backward.
 """
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -88,6 +89,10 @@ class ReferenceRasterizer:
 
     def __init__(self, device: str | torch.device = "cpu") -> None:
         self.device = torch.device(device)
+
+    def reserved(self) -> AbstractContextManager[None]:
+        """See `Rasterizer`; nothing is shared here."""
+        return nullcontext()
 
     def __call__(self, splats: Splats, camera: Camera, T_cam_map: Pose) -> Raster:
         """Composite all splats over all pixels; memory grows with pixels times splats of one image row."""

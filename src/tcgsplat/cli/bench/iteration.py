@@ -4,6 +4,7 @@ import numpy as np
 
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.mapping import native_kernels as kernels
+from tcgsplat.mapping.native_optimization import filled
 from tcgsplat.render.numba_cpu.layout import CHANNELS, FEATURE, PARAMETERS, Floats, aligned
 from tcgsplat.render.numba_cpu.passes import Drawn, Passes, Workspace
 from tcgsplat.render.numba_cpu.phases import COUNTERS
@@ -30,13 +31,13 @@ class Iteration:
         self.parameters[FEATURE + 3] = 0.0
         self.parameters[FEATURE + 3, :n] = splats.features[:, 3].numpy()
         kernels.activate(self.raw.reshape(-1), self.parameters.reshape(-1), self._padded, 0, self._padded)
-        self._before = self.raw.copy()
-        self.first, self.second = np.zeros_like(self.raw), np.zeros_like(self.raw)
-        self._clocks: Floats = np.ones((2, self._padded), np.float32)
-        self._allowed: Floats = np.full(self._padded, np.inf, np.float32)
-        self._scale: Floats = np.ones(self._padded, np.float32)
+        self._before = filled(0.0, *self.raw.shape)
+        self._before[:] = self.raw
+        self.first, self.second = filled(0.0, *self.raw.shape), filled(0.0, *self.raw.shape)
+        self._clocks = filled(1.0, 2, self._padded)
+        self._allowed, self._scale = filled(np.inf, self._padded), filled(1.0, self._padded)
         self._constants: Floats = np.zeros(kernels.CONSTANTS, np.float32)
-        self._excess: Floats = np.zeros(self._padded, np.float32)
+        self._excess, self._visible = filled(0.0, self._padded), filled(0.0, self._padded)
         generator = np.random.default_rng(1)
         self._d_planes = generator.random((CHANNELS, camera.height, camera.width), np.float32)
 
@@ -46,10 +47,11 @@ class Iteration:
         grads, _ = self._passes.differentiate(
             drawn, self._d_planes, self._space.floats("grads", PARAMETERS, self._padded)
         )
+        self._visible[:] = drawn.visible
         arrays = (
             self._padded, self.raw.reshape(-1), self.parameters.reshape(-1), self._before.reshape(-1),
             self.first.reshape(-1), self.second.reshape(-1), self._clocks.reshape(-1), grads.reshape(-1),
-            drawn.visible.astype(np.float32), self._allowed, self._scale, self._constants, self._excess,
+            self._visible, self._allowed, self._scale, self._constants, self._excess,
         )  # fmt: skip
         self._passes.workers.share(kernels.adam_step, self._space.longs("progress", COUNTERS), lambda _: arrays)
 

@@ -1,6 +1,7 @@
 """The CPU rasterizer: torch values in and out, the kernels' two passes between."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -74,6 +75,10 @@ class NumbaRasterizer:
             alpha=planes[FEATURES + 2],
             visible=visible,
         )
+
+    def reserved(self) -> AbstractContextManager[None]:
+        """See `Rasterizer`."""
+        return self.passes.workers.reserved()
 
     def _draw(
         self, splats: Splats, features: Tensor, camera: Camera, T_cam_map: Pose

@@ -3,8 +3,10 @@
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +24,7 @@ class Workers:
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
-        self._door, self._callers = threading.Lock(), 0
+        self._door, self._busy = threading.Lock(), Counter[int]()
         self._helpers = ThreadPoolExecutor(threads - 1, thread_name_prefix="splat") if threads > 1 else None
 
     def together(self, work: Callable[[int], object], threads: int | None = None) -> None:
@@ -30,18 +32,33 @@ class Workers:
 
         A helper may come late, when all is done, or never: `work` must share itself out as threads come.
         """
+        with self.reserved():
+            free = self.threads - len(self._busy)
+            helpers = max(min((threads or self.threads) - 1, free), 0)
+            futures = [self._helpers.submit(work, k + 1) for k in range(helpers)] if self._helpers else []
+            try:
+                work(0)
+            finally:
+                for future in futures:
+                    if not future.cancel():
+                        future.result()
+
+    @contextmanager
+    def reserved(self) -> Iterator[None]:
+        """A core for the calling thread while inside: what others share is shared by one thread less.
+
+        More threads than cores would take turns, and in a phase all wait for the one whose turn it is not.
+        """
+        me = threading.get_ident()
         with self._door:
-            self._callers += 1
-            helpers = max(min(threads or self.threads, self.threads - self._callers + 1) - 1, 0)
-        futures = [self._helpers.submit(work, k + 1) for k in range(helpers)] if self._helpers else []
+            self._busy[me] += 1
         try:
-            work(0)
+            yield
         finally:
             with self._door:
-                self._callers -= 1
-            for future in futures:
-                if not future.cancel():
-                    future.result()
+                self._busy[me] -= 1
+                if not self._busy[me]:
+                    del self._busy[me]
 
     def share(
         self, kernel: Callable[..., bool], progress: npt.NDArray[np.int64], arguments: Callable[[int], Arguments]
