@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -23,6 +24,9 @@ from tcgsplat.datasets import Sequence, open_sequence
 from tcgsplat.datasets.playback import Arrival, Clock, in_turn, play
 from tcgsplat.errors import ArchiveError
 from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.scene.atlas import Atlas
+from tcgsplat.scene.submap import Submap
+from tcgsplat.scene.trajectory import Trajectory
 from tcgsplat.slam import Slam, StepReport
 from tcgsplat.storage import atomic
 from tcgsplat.storage.run_directory import RunDirectory
@@ -142,7 +146,7 @@ def record(
     observe: Callable[[StepReport, int], object],
     stopped: Callable[[], bool],
 ) -> Summary:
-    """Step SLAM through the frames; each sealed submap and the path so far are on disk before the next frame.
+    """Step SLAM through the frames; each sealed submap and the path so far are written beside the next frames.
 
     Args:
         slam: A fresh system.
@@ -155,26 +159,37 @@ def record(
         The summary, not yet written: the caller knows more about the run.
     """
     tally, gaussians = Tally(), 0
+
+    def write(submap: Submap, trajectory: Trajectory, atlas: Atlas) -> None:
+        run.write_submap(submap)
+        run.write_trajectory(trajectory, atlas)
+
     started = before = time.perf_counter()
-    for arrival in arrivals:
-        report = slam.step(arrival.frame)
-        tally.follow(arrival, time.perf_counter())
-        if report.sealed is not None:
-            run.write_submap(report.sealed)
-            run.write_trajectory(slam.trajectory, slam.atlas)
-            gaussians += len(report.sealed)
-        observe(report, arrival.dropped)
-        now = time.perf_counter()
-        tally.count(report, now - before - arrival.waited)
-        before = now
-        if stopped():
-            break
+    with ThreadPoolExecutor(1, thread_name_prefix="writer") as writer:
+        writing: Future[None] | None = None
+        for arrival in arrivals:
+            report = slam.step(arrival.frame)
+            tally.follow(arrival, time.perf_counter())
+            if report.sealed is not None:
+                if writing is not None:
+                    writing.result()  # one at a time, so that memory holds no more, and no failure is missed
+                writing = writer.submit(write, report.sealed, slam.trajectory, slam.atlas)
+                gaussians += len(report.sealed)
+            observe(report, arrival.dropped)
+            now = time.perf_counter()
+            tally.count(report, now - before - arrival.waited)
+            before = now
+            if stopped():
+                break
+        if writing is not None:
+            writing.result()
     interrupted = stopped()
     last = slam.finish()
     if last is not None:
-        run.write_submap(last)
+        write(last, slam.trajectory, slam.atlas)
         gaussians += len(last)
-    run.write_trajectory(slam.trajectory, slam.atlas)
+    else:
+        run.write_trajectory(slam.trajectory, slam.atlas)
     summary = tally.summary(
         submaps=run.submap_count,
         gaussians=gaussians,
