@@ -199,7 +199,7 @@ def test_the_ground_truth_plays_no_part_in_a_run(
 
 def test_a_run_in_real_time_tells_what_it_dropped(room_folder: Path, tmp_path: Path):
     out = tmp_path / "live"
-    work = ["--mapper.iterations", "60", "--schedule.map_every", "1"]  # more than a camera leaves time for
+    work = ["--tracker.solver", "descent", "--tracker.descent.iterations", "60"]  # more than a camera leaves time for
     done = tcgsplat("run", room_folder, *work, "--realtime", "--out", out)
     assert done.returncode == 0, done.stderr
     summary = RunDirectory.open(out).summary()

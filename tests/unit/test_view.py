@@ -1,5 +1,6 @@
 """From Gaussians and a camera to images that mean something."""
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 import pytest
@@ -96,6 +97,9 @@ class Recorder:
     def __call__(self, splats: Splats, camera: Camera, T_cam_map: torch.Tensor) -> Raster:
         self.splats.append(splats)
         return ReferenceRasterizer()(splats, camera, T_cam_map)
+
+    def reserved(self) -> AbstractContextManager[None]:
+        return nullcontext()
 
 
 def one(sh_degree: int = 0) -> Gaussians:
