@@ -56,7 +56,7 @@ def numba_finding() -> Finding:
         "AVX-512: yes, the kernels' vectors fill its registers"
         if binding.get_host_cpu_features().get("avx512f")
         else "AVX-512: no; results are the same, more slowly; a processor with AVX-512 is faster",
-        f"{place}; {'they are there' if compiled else 'none yet: the first run takes some ten seconds longer'}"
+        f"{place}; {'they are there' if compiled else 'none yet: the first run takes some twenty seconds longer'}"
         if os.access(cache if cache.exists() else cache.parent, os.W_OK)
         else f"{place}, which cannot be written: every run compiles anew; set NUMBA_CACHE_DIR to another folder",
     )

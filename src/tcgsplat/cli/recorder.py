@@ -116,7 +116,7 @@ def recorded(
     # 104 ms a frame, and the splat kernels have threads of their own.
     torch.set_num_threads(1)
     compiling = compile_kernels(
-        config, rasterizer, lambda: say("compiling kernels, once per machine: some ten seconds")
+        config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds")
     )
     try:
         with (

@@ -44,7 +44,7 @@ def command(args: Args) -> int:
     config = from_toml(run.config_toml)
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     torch.set_num_threads(1)  # as in a run: the kernels have threads of their own
-    compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some ten seconds"))
+    compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
     generator, submaps = torch.Generator().manual_seed(config.seed), run.submap_count
     with counting("submap") as tell:
         for index in range(submaps):

@@ -111,7 +111,7 @@ def command(args: Track, settings: Mapping[str, str]) -> int:
 def measured(sequence: datasets.Sequence, config: SlamConfig, rasterizer: Rasterizer) -> Timed:
     """SLAM through a whole sequence, once its kernels are compiled, timed frame by frame."""
     torch.set_num_threads(1)  # as `recorded` does, which says why
-    compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some ten seconds"))
+    compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
     slam, lost = Slam(config, rasterizer), 0
     seconds: list[Mapping[str, float]] = []
     updates: list[float] = []
