@@ -120,7 +120,7 @@ class Slam:
 
         # Track: the map stands still, only the camera moves (equations 17 to 19).
         velocity, stamped = self.motion.steady, frame.depth_delay
-        frame = self.delay.corrected(frame) if self._learns_delay else frame
+        frame = frame.with_depth_later(self.delay.seconds) if self._learns_delay else frame
         with self._core():
             together = synchronized(frame, velocity) if self._synchronizes else frame
             tracked = self._tracked(together, guess=self.motion.predict(frame.timestamp))
@@ -135,8 +135,7 @@ class Slam:
 
         # Switch: seal the submap and anchor the next one at this camera (equation 16).
         may_map = tracked.converged and not (self._live and self._updates)
-        begins = bool((frame.valid & (frame.depth > 0)).any())  # a submap needs a surface to begin with
-        if may_map and begins and self._schedule.switches_submap(frame.index, T_map_cam, self.submap):
+        if may_map and self._schedule.switches_submap(frame.index, T_map_cam, self.submap) and frame.has_depth:
             update = self._finished_update() or update
             clock.lap("wait")
             sealed = self.submap.sealed(self.config.confidence)

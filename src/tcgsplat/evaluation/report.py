@@ -264,10 +264,11 @@ def _quality(
     scores: dict[bool, list[ViewScore]] = {True: [], False: []}
     velocities = velocities_by_frame(*run.trajectory())
     gaussians = seen = 0
+    delay = learnt_delay(run)
     for index in range(run.submap_count):
         submap = run.load_submap(index)
         rows = [row for row in withheld if row.submap_index == index]
-        unseen = withheld_views(rows, velocities, sequence, learnt_delay(run)) if sequence is not None else iter(())
+        unseen = withheld_views(rows, velocities, sequence, delay) if sequence is not None else iter(())
         for view in in_turn(training_views(submap, slice(-seen % stride, None, stride)), unseen):
             rendering = render_view(submap, view.frame.camera, view.T_map_cam, rasterizer)
             scores[view.withheld].append(ViewScore.of(rendering, view.frame))

@@ -3,7 +3,7 @@
 import heapq
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -115,8 +115,7 @@ def withheld_views(
         DatasetError: if one cannot be read.
     """
     for row in rows:
-        frame = sequence.frame(row.frame_index)
-        frame = replace(frame, depth_timestamp=frame.timestamp + frame.depth_delay + delay)
+        frame = sequence.frame(row.frame_index).with_depth_later(delay)
         frame = synchronized(frame, velocities[row.frame_index])
         yield PosedFrame(frame, row.T_map_cam, withheld=True)
 

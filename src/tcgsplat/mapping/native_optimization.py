@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,6 @@ from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.losses import SSIM_C1, SSIM_C2, ssim_window
 from tcgsplat.render.numba_cpu.layout import CHANNELS, FEATURE, PARAMETERS, Floats, aligned
 from tcgsplat.render.numba_cpu.passes import Passes, Workspace
-from tcgsplat.render.numba_cpu.phases import COUNTERS
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag
@@ -56,7 +56,8 @@ class NativeOptimization:
         self._reconstruction = self._stability_weight = 0.0
         n = len(submap)
         self._padded = -(-max(n, 1) // 16) * 16
-        self._raw = _matrix(submap.gaussians, self._padded)
+        g = submap.gaussians
+        self._raw = packed(self._padded, g.means, g.quats, g.log_scales, g.logit_opacities, g.sh)
         self._before = filled(0.0, *self._raw.shape)
         self._before[:] = self._raw
         self._parameters: Floats = aligned((PARAMETERS, self._padded))  # type: ignore[assignment]
@@ -157,7 +158,7 @@ class NativeOptimization:
 
     def _share(self, kernel: Callable[..., bool], phases: int, arguments: Callable[[int], tuple[object, ...]]) -> None:
         """A kernel on all threads; `arguments` are those of each worker."""
-        self._passes.workers.share(kernel, self._space.longs("progress", phases * COUNTERS), arguments)
+        self._passes.workers.share(partial(kernel, self._space.progress(phases)), arguments)
 
     def _row(self, padding: float, values: torch.Tensor | None) -> Floats:
         """A value for each Gaussian, padded; all padding where there are none."""
@@ -221,13 +222,13 @@ def _rates(config: MapperConfig) -> Floats:
     return np.array(per_row, np.float32)
 
 
-def _matrix(gaussians: Gaussians, padded: int) -> Floats:
-    """Raw parameters as rows; padding is too faint to be drawn."""
-    matrix: Floats = aligned((kernels.ROWS, padded))  # type: ignore[assignment]
-    matrix[:, len(gaussians) :] = 1.0
-    matrix[kernels.LOGIT, len(gaussians) :] = _FAINT
-    columns = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities, gaussians.sh)
-    kernels.pack(*(np.ascontiguousarray(column.detach().numpy()) for column in columns), matrix)
+def packed(padded: int, *tables: torch.Tensor) -> Floats:
+    """Raw parameters as rows [ROWS, padded], from means, quats, log scales, logits and harmonics; padding is too faint
+    to be drawn.
+    """
+    matrix = filled(1.0, kernels.ROWS, padded)
+    matrix[kernels.LOGIT] = _FAINT
+    kernels.pack(*(np.ascontiguousarray(table.detach().numpy()) for table in tables), matrix)
     return matrix
 
 

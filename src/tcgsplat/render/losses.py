@@ -39,9 +39,7 @@ class _CpuSsim(torch.autograd.Function):
         a, b = (np.ascontiguousarray(x.detach().permute(2, 0, 1).numpy()) for x in (rendered, observed))
         window = ssim_window().numpy()
         similarity, *partials = (np.empty_like(a) for _ in range(4))
-        ssim_kernels.forward(
-            a, b, window, np.float32(SSIM_C1), np.float32(SSIM_C2), 0, a.shape[1], similarity, *partials
-        )
+        ssim_kernels.forward(a, b, window, np.float32(SSIM_C1), np.float32(SSIM_C2), similarity, *partials)
         ctx.inputs = a, b, partials, window
         return torch.from_numpy(similarity).permute(1, 2, 0)
 
@@ -49,7 +47,7 @@ class _CpuSsim(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         a, b, partials, window = ctx.inputs
         upstream, out = np.ascontiguousarray(gradient.permute(2, 0, 1).numpy()), np.empty_like(a)
-        ssim_kernels.backward(upstream, a, b, *partials, window, 0, a.shape[1], out)  # type: ignore[call-arg]
+        ssim_kernels.backward(upstream, a, b, *partials, window, out)  # type: ignore[call-arg]
         return torch.from_numpy(out).permute(1, 2, 0), None
 
 

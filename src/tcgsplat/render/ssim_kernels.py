@@ -38,26 +38,23 @@ def _down(rows, y, window, out):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=_FAST, error_model="numpy", nogil=True, cache=True)
-def forward(a, b, window, c1, c2, first, last, similarity, by_mean, by_aa, by_ab):  # type: ignore[no-untyped-def]
-    """S of images [channels, h, w] and its partial derivatives by m_a, E[aa] and E[ab], maps of the same shape.
-
-    Only the rows from `first` on and before `last` are made, so that threads can share an image.
-    """
+def forward(a, b, window, c1, c2, similarity, by_mean, by_aa, by_ab):  # type: ignore[no-untyped-def]
+    """S of images [channels, h, w] and its partial derivatives by m_a, E[aa] and E[ab], maps of the same shape."""
     channels, h, w = a.shape
-    rows = np.zeros((5, last - first + 2 * RADIUS, w), np.float32)
+    rows = np.zeros((5, h + 2 * RADIUS, w), np.float32)
     line, average = np.zeros((5, w + 2 * RADIUS), np.float32), np.empty((5, w), np.float32)
     for c in range(channels):
-        for y in range(max(first - RADIUS, 0), min(last + RADIUS, h)):
+        for y in range(h):
             ra, rb = a[c, y], b[c, y]
             for x in range(w):
                 va, vb = ra[x], rb[x]
                 line[0, x + RADIUS], line[1, x + RADIUS] = va, vb
                 line[2, x + RADIUS], line[3, x + RADIUS], line[4, x + RADIUS] = va * va, vb * vb, va * vb
             for m in range(5):
-                _across(line[m], window, rows[m, y - first + RADIUS])
-        for y in range(first, last):
+                _across(line[m], window, rows[m, y + RADIUS])
+        for y in range(h):
             for m in range(5):
-                _down(rows[m], y - first, window, average[m])
+                _down(rows[m], y, window, average[m])
             for x in range(w):
                 ma, mb, ab = average[0, x], average[1, x], average[4, x]
                 luminance, structure = _TWO * ma * mb + c1, _TWO * (ab - ma * mb) + c2
@@ -74,23 +71,23 @@ def forward(a, b, window, c1, c2, first, last, similarity, by_mean, by_aa, by_ab
 
 
 @njit(fastmath=_FAST, error_model="numpy", nogil=True, cache=True)
-def backward(upstream, a, b, by_mean, by_aa, by_ab, window, first, last, out):  # type: ignore[no-untyped-def]
-    """dL/da from dL/dS, all [channels, h, w], for the rows from `first` on and before `last`."""
+def backward(upstream, a, b, by_mean, by_aa, by_ab, window, out):  # type: ignore[no-untyped-def]
+    """dL/da from dL/dS, all [channels, h, w]."""
     channels, h, w = a.shape
-    rows = np.zeros((3, last - first + 2 * RADIUS, w), np.float32)
+    rows = np.zeros((3, h + 2 * RADIUS, w), np.float32)
     line, average = np.zeros((3, w + 2 * RADIUS), np.float32), np.empty((3, w), np.float32)
     for c in range(channels):
-        for y in range(max(first - RADIUS, 0), min(last + RADIUS, h)):
+        for y in range(h):
             for x in range(w):
                 g = upstream[c, y, x]
                 line[0, x + RADIUS] = g * by_mean[c, y, x]
                 line[1, x + RADIUS] = g * by_aa[c, y, x]
                 line[2, x + RADIUS] = g * by_ab[c, y, x]
             for m in range(3):
-                _across(line[m], window, rows[m, y - first + RADIUS])
-        for y in range(first, last):
+                _across(line[m], window, rows[m, y + RADIUS])
+        for y in range(h):
             for m in range(3):
-                _down(rows[m], y - first, window, average[m])
+                _down(rows[m], y, window, average[m])
             ra, rb = a[c, y], b[c, y]
             for x in range(w):
                 out[c, y, x] = average[0, x] + _TWO * ra[x] * average[1, x] + rb[x] * average[2, x]

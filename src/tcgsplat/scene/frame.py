@@ -34,6 +34,15 @@ class Frame:
         """Seconds from the colour image to the depth image; negative where depth came first."""
         return 0.0 if self.depth_timestamp is None else self.depth_timestamp - self.timestamp
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether a surface was measured anywhere: a map can begin."""
+        return bool((self.valid & (self.depth > 0)).any())
+
+    def with_depth_later(self, seconds: float) -> "Frame":
+        """The same frame whose depth image was taken so much later than it says."""
+        return replace(self, depth_timestamp=self.timestamp + self.depth_delay + seconds)
+
     def to(self, device: torch.device) -> "Frame":
         """The same frame on another device; itself if it is there already."""
         if self.color.device == device:

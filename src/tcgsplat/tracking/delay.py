@@ -5,11 +5,10 @@ milliseconds: at hand speed that is millimetres, more than the noise of either i
 that depth alone asks for then runs ahead of the pose that colour alone asks for, by the velocity times the delay.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from tcgsplat.scene.frame import Frame
 from tcgsplat.tracking.alignment import Doubles, Equations
 
 _PRIOR = 0.01
@@ -59,10 +58,6 @@ class DepthDelay:
         unexplained = max(self.squares - self.evidence**2 / self.information, 0.0) / (6 * self.frames)
         delay = self.evidence / (self.information + _ALIKE * unexplained / _PRIOR**2)
         return float(np.clip(delay, -_LARGEST, _LARGEST))
-
-    def corrected(self, frame: Frame) -> Frame:
-        """The frame with its depth at the time at which it was really taken."""
-        return replace(frame, depth_timestamp=frame.timestamp + frame.depth_delay + self.seconds)
 
     def observed(self, velocity: Doubles, applied: Doubles, color: Equations, depth: Equations) -> "DepthDelay":
         """After one more frame.

@@ -113,8 +113,7 @@ class Tracker:
         In an empty submap the guess is the pose, unless there is no depth to begin a map with.
         """
         if len(submap) == 0:
-            begins = bool((frame.valid & (frame.depth > 0)).any())
-            return Tracked(guess, "" if begins else "there is no map yet, and no depth to begin one with")
+            return Tracked(guess, "" if frame.has_depth else "there is no map yet, and no depth to begin one with")
         if self._config.solver == "descent":
             found = descend(frame, submap, guess, self._rasterizer, self._config.descent, floor=self._floor)
             rendering = render_view(submap, frame.camera, found.T_map_cam, self._rasterizer)

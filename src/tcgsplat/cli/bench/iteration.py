@@ -1,18 +1,16 @@
 """An iteration of mapping's optimisation as its kernels run it, once the loss has been differentiated by the images."""
 
+from functools import partial
+
 import numpy as np
 
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.mapping import native_kernels as kernels
-from tcgsplat.mapping.native_optimization import filled
+from tcgsplat.mapping.native_optimization import filled, packed
 from tcgsplat.render.numba_cpu.layout import CHANNELS, FEATURE, PARAMETERS, Floats, aligned
 from tcgsplat.render.numba_cpu.passes import Drawn, Passes, Workspace
-from tcgsplat.render.numba_cpu.phases import COUNTERS
 from tcgsplat.render.protocol import Splats
 from tcgsplat.scene.gaussians import SH_C0
-
-_FAINT = -60.0
-"""Logit of an opacity that no rasterizer draws."""
 
 
 class Iteration:
@@ -26,7 +24,8 @@ class Iteration:
         n = len(splats.means)
         self._camera, self._passes, self._space = camera, passes, Workspace()
         self._padded = -(-n // 16) * 16
-        self.raw = _raw(splats, self._padded)
+        sh = (splats.features[:, None, :3] - 0.5) / SH_C0
+        self.raw = packed(self._padded, splats.means, splats.quats, splats.scales.log(), splats.opacities.logit(), sh)
         self.parameters: Floats = aligned((PARAMETERS, self._padded))  # type: ignore[assignment]
         self.parameters[FEATURE + 3] = 0.0
         self.parameters[FEATURE + 3, :n] = splats.features[:, 3].numpy()
@@ -53,19 +52,8 @@ class Iteration:
             self.first.reshape(-1), self.second.reshape(-1), self._clocks.reshape(-1), grads.reshape(-1),
             self._visible, self._allowed, self._scale, self._constants, self._excess,
         )  # fmt: skip
-        self._passes.workers.share(kernels.adam_step, self._space.longs("progress", COUNTERS), lambda _: arrays)
+        self._passes.workers.share(partial(kernels.adam_step, self._space.progress(1)), lambda _: arrays)
 
     def draw(self) -> Drawn:
         """The forward pass alone."""
         return self._passes.draw(self.parameters, self._camera, np.eye(4))
-
-
-def _raw(splats: Splats, padded: int) -> Floats:
-    """The parameters that are optimised, [ROWS, padded]; padding is too faint to be drawn."""
-    matrix: Floats = aligned((kernels.ROWS, padded))  # type: ignore[assignment]
-    matrix[:, len(splats.means) :] = 1.0
-    matrix[kernels.LOGIT, len(splats.means) :] = _FAINT
-    sh = (splats.features[:, None, :3] - 0.5) / SH_C0
-    tables = (splats.means, splats.quats, splats.scales.log(), splats.opacities.logit(), sh)
-    kernels.pack(*(np.ascontiguousarray(table.numpy()) for table in tables), matrix)
-    return matrix

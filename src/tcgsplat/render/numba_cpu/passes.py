@@ -5,13 +5,11 @@ fixed order, and pose sums over fixed units of splats.
 """
 
 import math
-import time
 import weakref
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,10 +32,9 @@ from tcgsplat.render.numba_cpu.layout import (
     aligned,
 )
 from tcgsplat.render.numba_cpu.phases import COUNTERS
-from tcgsplat.render.numba_cpu.workers import Workers, available_cores
+from tcgsplat.render.numba_cpu.workers import Arguments, Workers, available_cores
 from tcgsplat.render.protocol import JACOBIAN_MARGIN
 
-Arguments = tuple[Any, ...]
 _KEPT = 2
 """Workspaces kept for later: one for mapping, one for tracking at the same time."""
 
@@ -63,6 +60,12 @@ class Workspace:
     def longs(self, name: str, *shape: int) -> npt.NDArray[np.int64]:
         """The same in int64."""
         return self._array(name, shape, np.int64)  # type: ignore[return-value]
+
+    def progress(self, phases: int) -> npt.NDArray[np.int64]:
+        """Of a kernel of so many phases (see `phases.py`), none of them begun."""
+        progress = self.longs("progress", phases * COUNTERS)
+        progress[:] = 0
+        return progress
 
     def _array(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[np.generic]:
         size = math.prod(shape)
@@ -231,15 +234,8 @@ class Passes:
         space: Workspace,
     ) -> None:
         """A kernel on all threads, in one go; for `lap` stage by stage, which are given with their last phases."""
-        progress = space.longs("progress", (max(stages.values()) + 1) * COUNTERS)
-        progress[:] = 0
-
-        def work(last_phase: int, worker: int) -> None:
-            own = arguments(worker)
-            while not kernel(progress, last_phase, *own):
-                time.sleep(0)
-
+        progress = space.progress(max(stages.values()) + 1)
         for stage, last_phase in stages.items() if self._lap else [("", max(stages.values()))]:
-            self.workers.together(partial(work, last_phase))
+            self.workers.share(partial(kernel, progress, last_phase), arguments)
             if self._lap and stage:
                 self._lap(stage)

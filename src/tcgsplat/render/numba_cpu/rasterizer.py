@@ -1,6 +1,5 @@
 """The CPU rasterizer: torch values in and out, the kernels' two passes between."""
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -48,17 +47,10 @@ class NumbaRasterizer:
 
     name = "numba"
 
-    def __init__(self, threads: int | None = None, lap: Callable[[str], object] | None = None) -> None:
-        """A rasterizer on the CPU.
-
-        Args:
-            threads: Workers, by default as many as this process may run on.
-            lap: Called with its name at the end of every stage: pack, project, sort, bin, forward; backward, chain.
-                What comes before each pass, which is torch's, ends as `autograd`. For benchmarks.
-        """
+    def __init__(self, threads: int | None = None) -> None:
+        """A rasterizer on so many threads of the CPU, by default as many as this process may run on."""
         self.device = torch.device("cpu")
-        self.passes = Passes(threads, lap)
-        self.lap = lap or (lambda _: None)
+        self.passes = Passes(threads)
 
     def __call__(self, splats: Splats, camera: Camera, T_cam_map: Pose) -> Raster:
         """Draw; see `Rasterizer`."""
@@ -97,9 +89,7 @@ class _Draw(torch.autograd.Function):
         ctx: Any, rasterizer: NumbaRasterizer, camera: Camera, means: Tensor, quats: Tensor, scales: Tensor,
         opacities: Tensor, features: Tensor, T_cam_map: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        rasterizer.lap("autograd")
         parameters = _packed(Splats(means, quats, scales, opacities, features))
-        rasterizer.lap("pack")
         drawn = rasterizer.passes.draw(parameters, camera, T_cam_map.detach().to(torch.float64).numpy())
         visible_tensor = torch.from_numpy(drawn.visible[: len(means)])
         planes = torch.from_numpy(drawn.planes)
@@ -111,7 +101,6 @@ class _Draw(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, d_planes: Tensor, _d_visible: Tensor) -> tuple[Tensor | None, ...]:
         opacities, _ = ctx.saved_tensors
-        ctx.rasterizer.lap("autograd")
         n, drawn = len(opacities), ctx.drawn
         grads = drawn.workspace.floats("grads", PARAMETERS, drawn.padded)
         _, d_T = ctx.rasterizer.passes.differentiate(drawn, d_planes.contiguous().numpy(), grads)

@@ -8,9 +8,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
-import numpy as np
-import numpy.typing as npt
-
 Arguments = tuple[object, ...]
 
 
@@ -60,15 +57,12 @@ class Workers:
                 if not self._busy[me]:
                     del self._busy[me]
 
-    def share(
-        self, kernel: Callable[..., bool], progress: npt.NDArray[np.int64], arguments: Callable[[int], Arguments]
-    ) -> None:
-        """Run a kernel of phases (see `phases.py`) on all threads, each with its own arguments after `progress`."""
-        progress[:] = 0
+    def share(self, kernel: Callable[..., bool], arguments: Callable[[int], Arguments]) -> None:
+        """Run a kernel of phases (see `phases.py`) on all threads, each with its own arguments, until all is done."""
 
         def work(worker: int) -> None:
             own = arguments(worker)
-            while not kernel(progress, *own):
+            while not kernel(*own):
                 time.sleep(0)
 
         self.together(work)
