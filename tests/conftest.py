@@ -21,7 +21,7 @@ from tcgsplat.mapping.seeding import IdSource, SeedingConfig
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.backends import open_rasterizer
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.scene.submap import Submap
+from tcgsplat.scene.submap import Keyframe, Submap
 
 
 @pytest.fixture
@@ -46,5 +46,5 @@ def corner(rasterizer: Rasterizer) -> Submap:
     config = MapperConfig(seeding=seeding, first_iterations=30, depth_mode="planar", min_opacity=0.1)
     mapper = Mapper(config, ConfidenceConfig(), rasterizer, IdSource(), torch.Generator().manual_seed(0))
     frame = Room().frame()
-    mapped = mapper.optimized(mapper.grown(frame, se3.identity(), Submap.anchored(se3.identity(), index=0)))
+    mapped = mapper.optimized(mapper.grown(Keyframe(frame, se3.identity()), Submap.anchored(se3.identity(), index=0)))
     return judged(mapped, frame, ConfidenceConfig(), "planar")

@@ -22,7 +22,7 @@ from tcgsplat.mapping.seeding import IdSource
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.frame import Frame
-from tcgsplat.scene.submap import Submap
+from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory
 from tcgsplat.tensors import Pose
 from tcgsplat.tracking.delay import DepthDelay
@@ -151,7 +151,7 @@ class Slam:
             clock.lap("wait")
             with self._core():
                 together = synchronized(frame, self.motion.steady) if self._synchronizes else frame
-                grown = self._mapper.grown(together, T_map_cam, self.submap)
+                grown = self._mapper.grown(Keyframe(together, T_map_cam, tracked.exposure), self.submap)
             self.submap, self._since_mapped = grown.submap, 0
             if not grown.first or not len(self._reference.submap):
                 self._refer_to(self.submap)
@@ -162,7 +162,13 @@ class Slam:
                 clock.lap("wait")
 
         row = TrackedPose(
-            frame.index, frame.timestamp, self.submap.index, T_map_cam, lost=not tracked.converged, mapped=maps
+            frame_index=frame.index,
+            timestamp=frame.timestamp,
+            submap_index=self.submap.index,
+            T_map_cam=T_map_cam,
+            lost=not tracked.converged,
+            mapped=maps,
+            exposure=tracked.exposure,
         )
         self.trajectory = self.trajectory.with_row(row)
         return StepReport(

@@ -29,7 +29,7 @@ def submap() -> Submap:
     generator = torch.Generator().manual_seed(3)
     mapper = Mapper(MapperConfig(first_iterations=3), CONFIDENCE, RASTERIZER, IdSource(), generator)
     start = Submap.anchored(se3.identity(), index=0)
-    first = mapper.optimized(mapper.grown(Room().frame(), se3.identity(), start)).submap
+    first = mapper.optimized(mapper.grown(Keyframe(Room().frame(), se3.identity()), start)).submap
     T_side = pose(0.05, 0.02, 0.0, degrees=(0, 12, 0))
     side = Room().frame(T_side)
     valid = side.valid.clone()

@@ -183,12 +183,12 @@ def test_figures_of_a_run(run: RunDirectory, sequence: Recorded, rasterizer: Ras
     assert report.missing == {}
     assert unit == {
         "ate_rmse": "cm", "psnr_withheld": "dB", "ssim_withheld": "", "depth_l1_withheld": "cm",
-        "psnr_withheld_mapped": "dB", "coverage_withheld": "%", "psnr": "dB", "ssim": "",
-        "depth_l1": "cm", "depth_coverage": "%", "frames": "",
+        "psnr_withheld_unexposed": "dB", "psnr_withheld_mapped": "dB", "coverage_withheld": "%",
+        "psnr": "dB", "ssim": "", "depth_l1": "cm", "depth_coverage": "%", "frames": "",
         "frames_lost": "", "submaps": "", "gaussians": "", "ms_per_frame": "ms", "peak_rss_mb": "MB",
     }  # fmt: skip
-    assert list(unit)[:7] == ["ate_rmse", *(name for name in unit if "withheld" in name), "psnr"]
-    assert report.evaluated["poses"] == "estimated"
+    assert list(unit)[:8] == ["ate_rmse", *(name for name in unit if "withheld" in name), "psnr"]
+    assert report.evaluated["poses"] == "estimated, and so are exposures (psnr_withheld_unexposed: none)"
     assert "training views" in report.evaluated["views"]
     assert report.evaluated["withheld"].startswith("3 of 3 frames")
     assert report.evaluated["withheld"].endswith("spread evenly")
@@ -300,7 +300,7 @@ def test_killed_run_without_data_is_still_scored(run: RunDirectory, rasterizer: 
     assert report.metrics["psnr"].value > 50.0
     withheld = {name for name in report.missing if "withheld" in name}
     assert report.missing.keys() == {"ate_rmse", "ms_per_frame", "peak_rss_mb"} | withheld
-    assert len(withheld) == 5
+    assert len(withheld) == 6
     assert report.missing["psnr_withheld"] == "the sequence is not at hand"
     assert report.evaluated["withheld"].startswith("0 of 2 frames")
     assert report.missing["ate_rmse"] == "no ground truth"

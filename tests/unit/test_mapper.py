@@ -20,7 +20,7 @@ from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import render_view
 from tcgsplat.scene.frame import Frame
-from tcgsplat.scene.submap import Submap
+from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.tensors import Pose
 
 CONFIG = MapperConfig(
@@ -60,7 +60,7 @@ def mapped(
     mapper = Mapper(config, confidence, rasterizer, IdSource(first_id), generator)
     start = Submap.anchored(se3.identity(), index=0) if submap is None else submap
     T_map_cam = se3.identity() if T_map_cam is None else T_map_cam
-    return mapper.optimized(mapper.grown(frame or Room().frame(), T_map_cam, start))
+    return mapper.optimized(mapper.grown(Keyframe(frame or Room().frame(), T_map_cam), start))
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from tcgsplat.mapping.seeding import IdSource
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import render_view
-from tcgsplat.scene.submap import Submap
+from tcgsplat.scene.submap import Keyframe, Submap
 
 CONFIG = MapperConfig(iterations=1, first_iterations=1)
 CONFIDENCE = ConfidenceConfig().for_updates_of(10)
@@ -27,7 +27,8 @@ def submap(rasterizer: Rasterizer) -> Submap:
     mapper = Mapper(CONFIG, CONFIDENCE, rasterizer, IdSource(), torch.Generator().manual_seed(1))
     submap = Submap.anchored(se3.identity(), index=0)
     for index, T_map_cam in enumerate(POSES):
-        submap = mapper.optimized(mapper.grown(Room().frame(T_map_cam, index=index), T_map_cam, submap)).submap
+        keyframe = Keyframe(Room().frame(T_map_cam, index=index), T_map_cam)
+        submap = mapper.optimized(mapper.grown(keyframe, submap)).submap
     return submap
 
 

@@ -310,7 +310,8 @@ def _view(submap: Submap, posed: PosedFrame, rasterizer: Rasterizer, start: floa
     rendering = render_view(submap, frame.camera, posed.T_map_cam, rasterizer)
     kind = "withheld" if posed.withheld else "keyframe"
     title = f"{frame.timestamp - start:.1f} s, submap {submap.index}, {kind}"
-    return View(title, frame.color, rendering.color, rendering.depth, rendering.confidence)
+    color = posed.exposure.applied(rendering.color)
+    return View(title, frame.color, color, rendering.depth, rendering.confidence)
 
 
 def _depth_range(views: Sequence[View]) -> Normalize:

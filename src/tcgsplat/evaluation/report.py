@@ -34,6 +34,7 @@ from tcgsplat.tensors import Pose
 
 _WITHHELD = (
     ("psnr_withheld", "psnr", "dB"),
+    ("psnr_withheld_unexposed", "psnr_unexposed", "dB"),
     ("ssim_withheld", "ssim", ""),
     ("depth_l1_withheld", "depth_l1", "cm"),
     ("psnr_withheld_mapped", "psnr_mapped", "dB"),
@@ -112,7 +113,8 @@ def evaluate(
 
     - `ate_rmse`, cm: camera centres of all tracked frames that have a true pose, after rigid alignment.
     - `psnr_withheld` (dB), `ssim_withheld`, `depth_l1_withheld` (cm): frames of the sequence that were tracked and
-      never mapped.
+      never mapped, drawn at the pose and with the exposure that tracking found for them.
+    - `psnr_withheld_unexposed` (dB): the same in the map's own colours, as systems without exposures score.
     - `psnr_withheld_mapped` (dB), `coverage_withheld` (%): the PSNR of those of their valid pixels that the map covers
       by more than half, and the share of these: the rest is what holes cost.
     - `psnr` (dB), `ssim`, `depth_l1` (cm), `depth_coverage` (%): the keyframes, which the map was optimised on.
@@ -165,7 +167,7 @@ def evaluate(
             "withheld": _told_withheld(trajectory, len(withheld), len(drawn) if sequence is not None else 0),
             "views": f"{'all keyframes' if stride == 1 else f'one keyframe in {stride}'} of the saved submaps: "
             "training views; these and the withheld ones are each drawn from their own submap",
-            "poses": "estimated",
+            "poses": "estimated, and so are exposures (psnr_withheld_unexposed: none)",
             "pixels": "psnr and ssim: valid pixels, without the border that undistortion leaves empty; "
             f"psnr_withheld_mapped: those with alpha above {MIN_COVERAGE:g}; "
             "depth_l1: those with a sensor reading, unmapped ones in full",
@@ -271,7 +273,7 @@ def _quality(
         unseen = withheld_views(rows, velocities, sequence, delay) if sequence is not None else iter(())
         for view in in_turn(training_views(submap, slice(-seen % stride, None, stride)), unseen):
             rendering = render_view(submap, view.frame.camera, view.T_map_cam, rasterizer)
-            scores[view.withheld].append(ViewScore.of(rendering, view.frame))
+            scores[view.withheld].append(ViewScore.of(rendering, view))
             drawn(view.frame.index)
         gaussians += len(submap)
         seen += len(submap.keyframes)

@@ -13,6 +13,7 @@ from tcgsplat.datasets.sequence import Sequence
 from tcgsplat.evaluation import images
 from tcgsplat.render.view import MIN_COVERAGE, Rendering
 from tcgsplat.scene.atlas import Atlas
+from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory
@@ -27,10 +28,11 @@ then known to about 0.3 dB, and an evaluation takes seconds."""
 
 @dataclass(frozen=True)
 class PosedFrame:
-    """What the camera saw, and from where in a submap, as estimated, it saw it."""
+    """What the camera saw, and, as estimated, from where in a submap and how exposed it saw it."""
 
     frame: Frame
     T_map_cam: Pose
+    exposure: Exposure
     withheld: bool
     """The map was never optimised on this frame."""
 
@@ -41,6 +43,8 @@ class ViewScore:
 
     psnr: float
     """dB, over the valid pixels."""
+    psnr_unexposed: float
+    """dB, as if the picture's exposure were not known: the map's own colours; what other systems call PSNR."""
     ssim: float
     """Over the windows of valid pixels."""
     depth_l1: float
@@ -53,12 +57,14 @@ class ViewScore:
     """Percent of the valid pixels that are covered so."""
 
     @staticmethod
-    def of(rendering: Rendering, frame: Frame) -> "ViewScore":
-        """The score of a rendering from where `frame` was taken."""
-        color, depth = rendering.color.clamp(0.0, 1.0), rendering.depth
+    def of(rendering: Rendering, view: PosedFrame) -> "ViewScore":
+        """The score of a rendering from where the view's frame was taken."""
+        frame, depth = view.frame, rendering.depth
+        color = view.exposure.applied(rendering.color).clamp(0.0, 1.0)
         mapped, read = rendering.alpha > MIN_COVERAGE, frame.valid & (frame.depth > 0)
         return ViewScore(
             psnr=images.psnr(color, frame.color, frame.valid),
+            psnr_unexposed=images.psnr(rendering.color.clamp(0.0, 1.0), frame.color, frame.valid),
             ssim=images.ssim(color, frame.color, frame.valid),
             depth_l1=100.0 * images.depth_l1(depth, frame.depth, read),
             depth_coverage=100.0 * float((depth[read] > 0).to(depth.dtype).mean()),
@@ -97,7 +103,10 @@ def spread(rows: tuple[TrackedPose, ...], number: int) -> tuple[TrackedPose, ...
 
 def training_views(submap: Submap, places: slice) -> Iterator[PosedFrame]:
     """Keyframes of a submap, those at some places of their order."""
-    return (PosedFrame(keyframe.frame, keyframe.T_map_cam, withheld=False) for keyframe in submap.keyframes[places])
+    return (
+        PosedFrame(keyframe.frame, keyframe.T_map_cam, submap.exposure(keyframe), withheld=False)
+        for keyframe in submap.keyframes[places]
+    )
 
 
 def withheld_views(
@@ -117,7 +126,7 @@ def withheld_views(
     for row in rows:
         frame = sequence.frame(row.frame_index).with_depth_later(delay)
         frame = synchronized(frame, velocities[row.frame_index])
-        yield PosedFrame(frame, row.T_map_cam, withheld=True)
+        yield PosedFrame(frame, row.T_map_cam, row.exposure, withheld=True)
 
 
 def velocities_by_frame(trajectory: Trajectory, atlas: Atlas) -> dict[int, Float[Tensor, "6"]]:

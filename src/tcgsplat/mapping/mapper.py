@@ -14,7 +14,7 @@ from tcgsplat.render.view import Rendering, render_view
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
-from tcgsplat.tensors import PerGaussian, Pose
+from tcgsplat.tensors import PerGaussian
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class Grown:
 
     @property
     def frame(self) -> Frame:
-        """The frame that was taken in."""
-        return self.submap.keyframes[-1].frame
+        """The frame that was taken in, its colours as the map keeps them."""
+        return self.submap.balanced(self.submap.keyframes[-1])
 
 
 @dataclass(frozen=True)
@@ -71,14 +71,15 @@ class Mapper:
         self._ids = ids
         self._generator = generator
 
-    def grown(self, frame: Frame, T_map_cam: Pose, submap: Submap) -> Grown:
-        """The submap with `frame`, at `T_map_cam`, taken in."""
-        first = not submap.keyframes
-        rendering = None if first else render_view(submap, frame.camera, T_map_cam, self._rasterizer)
+    def grown(self, keyframe: Keyframe, submap: Submap) -> Grown:
+        """The submap with a new keyframe taken in."""
+        first, T_map_cam = not submap.keyframes, keyframe.T_map_cam
+        rendering = None if first else render_view(submap, keyframe.frame.camera, T_map_cam, self._rasterizer)
+        keyframes = thinned((*submap.keyframes, keyframe), self._config.max_keyframes)
+        submap = replace(submap, keyframes=keyframes)
+        frame = submap.balanced(keyframe)
         seeds = seed(frame, T_map_cam, rendering, submap.gaussians, self._ids, self._generator, self._config.seeding)
-        keyframes = thinned((*submap.keyframes, Keyframe(frame, T_map_cam)), self._config.max_keyframes)
-        grown = replace(submap.grown(seeds, self._confidence), keyframes=keyframes)
-        return Grown(grown, len(seeds), first)
+        return Grown(submap.grown(seeds, self._confidence), len(seeds), first)
 
     def optimized(self, grown: Grown) -> Mapped:
         """The grown submap, optimised over its keyframes."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from tcgsplat.geometry.camera import Camera
+from tcgsplat.scene.exposure import Exposure
 from tcgsplat.tensors import Image, Mask, Plane
 
 
@@ -42,6 +43,10 @@ class Frame:
     def with_depth_later(self, seconds: float) -> "Frame":
         """The same frame whose depth image was taken so much later than it says."""
         return replace(self, depth_timestamp=self.timestamp + self.depth_delay + seconds)
+
+    def unexposed(self, exposure: Exposure) -> "Frame":
+        """The same frame with its colours as the map keeps them; they may leave [0, 1]."""
+        return replace(self, color=exposure.removed(self.color))
 
     def to(self, device: torch.device) -> "Frame":
         """The same frame on another device; itself if it is there already."""

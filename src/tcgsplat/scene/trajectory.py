@@ -9,6 +9,7 @@ from torch import Tensor
 
 from tcgsplat.geometry import quaternion, se3
 from tcgsplat.scene.atlas import Atlas
+from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.tensors import Pose
 
 
@@ -26,6 +27,8 @@ class TrackedPose:
     mapped: bool = False
     """The map was optimised on this frame; it may have been dropped from the keyframes since. A frame that is neither
     mapped nor lost is withheld from the map: what the map shows of it tells how well it shows new views."""
+    exposure: Exposure = UNCHANGED
+    """Of its picture, beside the map's."""
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from torch import Tensor
 from tcgsplat.confidence.state import ConfidenceState
 from tcgsplat.errors import ArchiveError
 from tcgsplat.geometry.camera import Camera
+from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
@@ -121,6 +122,7 @@ def _pack_keyframe(keyframe: Keyframe) -> dict[str, Array]:
         "timestamp": np.array(frame.timestamp),
         "camera": np.array(astuple(frame.camera), dtype=np.float64),
         "T_map_cam": _array(keyframe.T_map_cam),
+        "exposure": np.array(astuple(keyframe.exposure), dtype=np.float64),
         "color": _encode_png(color[..., ::-1]),
         "depth": _encode_png((depth * units).round().clip(0, _DEPTH_UNITS_MAX).astype(np.uint16)),
         "depth_units_per_metre": np.array(units),
@@ -142,7 +144,8 @@ def _unpack_keyframe(arrays: Mapping[str, Array], prefix: str) -> Keyframe:
         valid=valid,
         camera=Camera(fx, fy, cx, cy, int(width), int(height)),
     )
-    return Keyframe(frame, torch.from_numpy(arrays[f"{prefix}T_map_cam"]))
+    exposure = arrays.get(f"{prefix}exposure", np.array(astuple(UNCHANGED)))  # an older tcgsplat knew none
+    return Keyframe(frame, torch.from_numpy(arrays[f"{prefix}T_map_cam"]), Exposure(*exposure.tolist()))
 
 
 def _encode_png(image: Array) -> Png:

@@ -15,7 +15,7 @@ Every file is complete or absent. A submap's file is written before the trajecto
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ import torch
 
 from tcgsplat.errors import ArchiveError
 from tcgsplat.scene.atlas import Atlas
+from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.submap import Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory, format_tum
 from tcgsplat.storage import archive, atomic
@@ -120,6 +121,7 @@ class RunDirectory:
                 "submap_index": np.array([row.submap_index for row in rows], dtype=np.int64),
                 "lost": np.array([row.lost for row in rows], dtype=np.bool_),
                 "mapped": np.array([row.mapped for row in rows], dtype=np.bool_),
+                "exposure": np.array([astuple(row.exposure) for row in rows], dtype=np.float64).reshape(-1, 2),
                 "T_map_cam": _stacked([row.T_map_cam for row in rows]),
                 "T_world_map": _stacked(list(atlas.T_world_map)),
             },
@@ -131,7 +133,7 @@ class RunDirectory:
         """The path and the submap poses as last written; both empty if the run has sealed nothing yet.
 
         A run of an older tcgsplat does not say which frames it mapped: then no row is `mapped`, while in any other run
-        at least the first row of each submap is.
+        at least the first row of each submap is. One that does not tell exposures took pictures as they came.
 
         Raises:
             ArchiveError: if the file is damaged or of another version.
@@ -141,15 +143,17 @@ class RunDirectory:
             return Trajectory(), Atlas()
         columns = archive.read_arrays(path, "trajectory")
         unknown = np.zeros(len(columns["lost"]), np.bool_)
+        unchanged = np.tile(astuple(UNCHANGED), (len(unknown), 1))
         rows = tuple(
-            TrackedPose(int(frame), float(stamp), int(submap), torch.from_numpy(T), bool(lost), bool(mapped))
-            for frame, stamp, submap, lost, mapped, T in zip(
+            TrackedPose(int(frame), float(stamp), int(submap), torch.from_numpy(T), bool(lost), bool(mapped), exposure)
+            for frame, stamp, submap, lost, mapped, T, exposure in zip(
                 columns["frame_index"],
                 columns["timestamp"],
                 columns["submap_index"],
                 columns["lost"],
                 columns.get("mapped", unknown),
                 columns["T_map_cam"],
+                (Exposure(*pair) for pair in columns.get("exposure", unchanged).tolist()),
                 strict=True,
             )
         )

@@ -17,6 +17,7 @@ from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.view import Rendering
+from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.tensors import Image, Plane, Pose
 from tcgsplat.tracking import alignment_kernels as kernels
@@ -32,6 +33,8 @@ _COARSEST = 80
 """Pixels across the coarsest level, at most: a pixel there is most of a degree, what a fast hand turns in a frame."""
 _SPARSE = 200
 """Pixels across from which on a level is sampled by `stride`: above it, neighbours say nearly the same."""
+_SOLID = 0.95
+"""Alpha from which on a pixel tells the exposure."""
 _STEP_PRIOR = 0.05
 """Spread of a step that is expected before anything is seen, metres and radians."""
 _LOW, _HIGH = np.sort(np.indices((6, 6)), axis=0)
@@ -97,6 +100,8 @@ class Alignment:
     """Share of the overlap's depth readings that agree within the gate; 1 where there is none to ask."""
     correlation: float
     """Of live and rendered intensity where the depth does not disagree, in [-1, 1]; does not feel the exposure."""
+    exposure: Exposure
+    """Of the frame's intensity over the rendered view's, composited on black."""
     color: Equations
     """What colour alone asks for at the pose that was found."""
     depth: Equations
@@ -119,6 +124,8 @@ class _Level:
     """Of the frame, [h, w, CHANNELS]."""
     intrinsics: Floats
     """fx, fy, cx, cy, pixels."""
+    sampling: tuple[int, int]
+    """Radius and stride of the points, pixels."""
     gate: float
     """Metres, times (1 + z/2)."""
 
@@ -145,10 +152,10 @@ def _levels(frame: Frame, rendering: Rendering, weight: Plane, config: Alignment
             camera = camera.scaled(0.5)
         if passes:
             intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-            stride, radius = (config.stride, 2) if camera.width > _SPARSE else (1, 1)
+            sampling = (2, config.stride) if camera.width > _SPARSE else (1, 1)
             gate = 2 * config.gate if number else config.gate
-            points = kernels.reference_points(intensity, depth, weights, intrinsics, radius, stride)
-            levels.append(_Level(passes, points, kernels.live_image(live, live_depth), intrinsics, gate))
+            points = kernels.reference_points(intensity, depth, weights, intrinsics, *sampling)
+            levels.append(_Level(passes, points, kernels.live_image(live, live_depth), intrinsics, sampling, gate))
     return levels
 
 
@@ -198,6 +205,25 @@ def _constants(level: _Level, T: Doubles, photometry: _Photometry, config: Align
     constants[kernels.GATE : kernels.SIGMA_FLOOR] = level.gate, config.depth_weight
     constants[kernels.SIGMA_FLOOR :] = config.sigma_floor, config.sigma_slope
     return constants
+
+
+def _exposure(
+    rendering: Rendering, weight: Plane, level: _Level, T: Doubles, photometry: _Photometry, config: AlignmentConfig
+) -> Exposure:
+    """Of the frame over the rendered view, at the pose that was found, where the map is all but opaque.
+
+    The solver compares with colours that are divided by alpha. Through thin places the background of the map's frame
+    shows, which optimisation closes in time: dividing makes them too bright, not dividing leaves them too dark.
+    """
+    color = rendering.color.numpy()
+    _, depth = kernels.rendered_view(
+        color, rendering.composited_plane_depth.numpy(), rendering.alpha.numpy(), np.float32(_SOLID)
+    )
+    weights = np.ascontiguousarray(weight.numpy())
+    points = kernels.reference_points(kernels.luma(color), depth, weights, level.intrinsics, *level.sampling)
+    found = replace(photometry)
+    found.refit(kernels.normal_equations(points, level.live, _constants(level, T, photometry, config)))
+    return Exposure(found.gain, found.offset)
 
 
 def _separated(level: _Level, T: Doubles, photometry: _Photometry, config: AlignmentConfig) -> list[Equations]:
@@ -270,6 +296,7 @@ def align(frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, co
             *(float(sums[k]) for k in (kernels.GAIN_W, kernels.GAIN_R, kernels.GAIN_L)),
             *(float(sums[k]) for k in (kernels.GAIN_RR, kernels.GAIN_RL, kernels.GAIN_LL)),
         ),
+        exposure=_exposure(rendering, weight, finest, T, photometry, config),
         color=color,
         depth=depth,
     )

@@ -16,6 +16,7 @@ from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import Rendering, render_view
+from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
@@ -32,6 +33,9 @@ class TrackerConfig:
     synchronization: Literal["none", "stamps", "learnt"] = "learnt"
     """What is done about the time between colour and depth: nothing; the depth image is moved to the instant of the
     colour image by the camera's velocity; so, and what the time stamps conceal is learnt from the motion. [ours]"""
+    exposure: bool = True
+    """Whether the map keeps one brightness and every picture its exposure beside it, as `alignment` finds it; else
+    pictures are mapped as they come. [ours]"""
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
     max_step: float = 0.3
@@ -73,6 +77,8 @@ class Tracked:
     """Share of the depth readings there that agree with the map."""
     correlation: float = 1.0
     """Between the colours of the picture and of the map, in [-1, 1]."""
+    exposure: Exposure = UNCHANGED
+    """Of the picture, beside the map's."""
     color: Equations | None = None
     """What colour alone asks for at this pose, from solvers that know."""
     depth: Equations | None = None
@@ -125,10 +131,17 @@ class Tracker:
         else:
             weight = eq.tracking_weight(rendering.confidence, floor=self._floor)
         aligned = align(frame, rendering, weight, guess, self._config.alignment)
-        compared = (aligned.overlap, aligned.agreement, aligned.correlation)
-        return self._believed(
-            guess, Tracked(aligned.T_map_cam, "", aligned.iterations, *compared, aligned.color, aligned.depth)
+        tracked = Tracked(
+            aligned.T_map_cam,
+            iterations=aligned.iterations,
+            overlap=aligned.overlap,
+            agreement=aligned.agreement,
+            correlation=aligned.correlation,
+            exposure=aligned.exposure if self._config.exposure else UNCHANGED,
+            color=aligned.color,
+            depth=aligned.depth,
         )
+        return self._believed(guess, tracked)
 
     def _believed(self, guess: Pose, found: Tracked) -> Tracked:
         """The solver's answer, or the guess and the reason why not."""
