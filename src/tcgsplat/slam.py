@@ -136,8 +136,13 @@ class Slam:
         # Switch: seal the submap and anchor the next one at this camera (equation 16).
         may_map = tracked.converged and not (self._live and self._updates)
         if may_map and self._schedule.switches_submap(frame.index, T_map_cam, self.submap) and frame.has_depth:
-            update = self._finished_update() or update
+            fresh = self._finished_update()
             clock.lap("wait")
+            if fresh is not None:  # all that follows hangs on this pose: it is found again in the newest map
+                update, anchor = fresh, self._tracked(together, guess=T_map_cam)
+                tracked = anchor if anchor.converged else tracked
+                T_map_cam = tracked.T_map_cam
+                clock.lap("track")
             sealed = self.submap.sealed(self.config.confidence)
             self._reference = Reference(self.submap, se3.inverse(T_map_cam))
             self.submap = self._anchored(self.submap.T_world_map @ T_map_cam, index=len(self.atlas))
@@ -157,7 +162,8 @@ class Slam:
                 self._refer_to(self.submap)
             self._updating = self._mapping_thread.submit(self._updated, grown)
             clock.lap("grow")
-            if self.config.schedule.map_lag == 0 and not self._live:
+            raw = grown.first and self._reference.submap is self.submap  # one picture's seeds are all there is
+            if (raw or self.config.schedule.map_lag == 0) and not self._live:
                 update = self._finished_update()
                 clock.lap("wait")
 

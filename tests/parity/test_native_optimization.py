@@ -17,6 +17,7 @@ from tcgsplat.mapping.optimizer import PARAMETERS
 from tcgsplat.mapping.seeding import IdSource
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.numba_cpu import NumbaRasterizer
+from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.submap import Keyframe, Submap
 
 CONFIDENCE = ConfidenceConfig().for_updates_of(10)
@@ -90,6 +91,31 @@ def test_takes_the_steps_of_autograd(submap: Submap, guidance: str, depth_mode: 
         assert float((a - old).abs().max()) > 0.5 * step
         # Adam makes a full step of any gradient, so that a sign lost in rounding is a step in the other direction.
         assert float(((a - b).abs() < 0.02 * step).float().mean()) > (0.95 if guidance == "strong" else 0.98)
+
+
+def test_unequal_exposures_are_balanced_alike(submap: Submap) -> None:
+    """Both compare with the pictures as the map keeps them, and both feel it."""
+    plain = submap.keyframes[1]
+    exposed = replace(submap, keyframes=(submap.keyframes[0], replace(plain, exposure=Exposure(0.7, 0.05))))
+    frames = tuple(replace(keyframe, frame=exposed.balanced(keyframe)) for keyframe in exposed.keyframes)
+    assert exposed.balanced(exposed.keyframes[1]).color.max() > 1  # nor is it clipped
+    by_hand = replace(submap, keyframes=tuple(replace(k, exposure=Exposure()) for k in frames))
+    results = []
+    for each in (exposed, by_hand, submap):
+        for optimization in both(each, MapperConfig(), CONFIDENCE):
+            losses = []
+            for view in (0, 1, 1):
+                optimization.step(view)
+                losses.append(optimization.loss)
+            results.append((losses, optimization.submap().gaussians))
+    (slow, slow_map), (fast, fast_map), (_, slow_by_hand), (_, fast_by_hand), (unfelt, _), _ = results
+    assert fast == pytest.approx(slow, rel=2e-5)
+    assert all(abs(a - b) > 0.02 * b for a, b in zip(slow, unfelt, strict=True))
+    for name in PARAMETERS:
+        assert torch.equal(getattr(slow_map, name), getattr(slow_by_hand, name))
+        assert torch.equal(getattr(fast_map, name), getattr(fast_by_hand, name))
+        agree = (getattr(slow_map, name) - getattr(fast_map, name)).abs() < 0.02 * getattr(MapperConfig().rates, name)
+        assert float(agree.float().mean()) > 0.98
 
 
 def test_the_self_distance_is_between_rows_of_the_same_id(submap: Submap) -> None:

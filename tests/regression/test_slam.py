@@ -22,7 +22,7 @@ from tcgsplat.scene.submap import Submap
 from tcgsplat.slam import Slam, StepReport
 from tcgsplat.tensors import Pose
 from tcgsplat.tracking.alignment import AlignmentConfig
-from tcgsplat.tracking.tracker import TrackerConfig
+from tcgsplat.tracking.tracker import Tracker, TrackerConfig
 
 CONFIG = SlamConfig(
     tracker=TrackerConfig(solver="alignment", alignment=AlignmentConfig(iterations=(4, 3, 3), stride=2)),
@@ -106,6 +106,7 @@ class TestLag:
         used = {r.update.frame_index: r.frame_index for r in walked.reports if r.update}
         switched = [report.frame_index for report in walked.reports if report.sealed]
         assert list(used) == begun[: len(used)] and len(used) >= len(begun) - 1
+        assert used.pop(0) == 0  # the run's first map is waited for: there is none before it
         for frame, later in used.items():
             assert later == min(frame + 4, *(s for s in switched if s > frame), 99)
 
@@ -119,10 +120,30 @@ class TestLag:
                 assert slam.submap.clock == 1 + index // 4
 
     def test_what_is_seeded_is_tracked_against_at_once(self, rasterizer: Rasterizer) -> None:
-        slam = Slam(CONFIG, rasterizer)
+        slam = Slam(CONFIG, rasterizer, live=True)  # which does not even wait for the first map
         report = slam.step(SEQUENCE.frame(0))
         assert report.update is None and report.gaussians == len(slam.submap) > 1000
         assert not slam.step(SEQUENCE.frame(1)).tracked.lost
+
+    def test_a_submap_begins_where_the_newest_map_has_its_first_frame(self, rasterizer: Rasterizer) -> None:
+        """Not where the map that is a lag old has it, which the frames before were tracked against."""
+        config = replace(
+            CONFIG,
+            tracker=replace(CONFIG.tracker, synchronization="none"),
+            schedule=replace(CONFIG.schedule, submap_by="interval", submap_interval=6),
+            confidence=replace(CONFIG.confidence, guide_tracking=False),  # sealing changes confidence
+        )
+        slam, tracker = Slam(config, rasterizer), Tracker(config.tracker, config.confidence, rasterizer)
+        for frame in SEQUENCE:
+            old, guess = slam.submap, slam.motion.predict(frame.timestamp)
+            report = slam.step(frame)
+            if report.sealed is not None:
+                break
+        assert report.frame_index == 6 and report.update and report.update.frame_index == 4
+        stale = tracker.track(frame, old, guess).T_map_cam
+        fresh = tracker.track(frame, report.sealed, stale).T_map_cam
+        torch.testing.assert_close(report.tracked.T_map_cam, fresh, atol=1e-9, rtol=0)
+        assert not torch.allclose(fresh, stale, atol=1e-5)
 
 
 class TestReference:

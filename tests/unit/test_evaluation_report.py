@@ -20,12 +20,13 @@ from tcgsplat.render.backends import open_rasterizer
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import render_view
 from tcgsplat.scene.atlas import Atlas
+from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory, format_tum
 from tcgsplat.storage.run_directory import RunDirectory
-from tcgsplat.tensors import Pose
+from tcgsplat.tensors import Image, Pose
 
 CAMERA = Camera(fx=40.0, fy=40.0, cx=23.5, cy=15.5, width=48, height=32)
 OFFSET = 0.05
@@ -193,6 +194,67 @@ def test_figures_of_a_run(run: RunDirectory, sequence: Recorded, rasterizer: Ras
     assert report.evaluated["withheld"].startswith("3 of 3 frames")
     assert report.evaluated["withheld"].endswith("spread evenly")
     assert report.evaluated["trajectory"].startswith("7 of 8 frames")
+
+
+def drawn_at(run: RunDirectory, row: TrackedPose, rasterizer: Rasterizer) -> Image:
+    """The map's own colours, not clipped."""
+    return render_view(run.load_submap(row.submap_index), CAMERA, row.T_map_cam, rasterizer).color
+
+
+def exposed(run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer, exposure: Exposure) -> Recorded:
+    """The run, with all its rows and keyframes told to be exposed so, and the pictures that are."""
+    trajectory, atlas = run.trajectory()
+    rows = tuple(replace(row, exposure=exposure) for row in trajectory.rows)
+    run.write_trajectory(Trajectory(rows), atlas)
+    frames = []
+    for row, frame in zip(rows, sequence.frames, strict=True):
+        color = drawn_at(run, row, rasterizer)
+        frames.append(replace(frame, color=exposure.applied(color).clamp(0, 1)))
+    return replace(sequence, frames=tuple(frames))
+
+
+@pytest.mark.parametrize("exposure", [Exposure(0.8), Exposure(0.9, -0.05), Exposure(1.25, 0.05)], ids=str)
+def test_withheld_views_are_drawn_as_exposed(
+    run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer, exposure: Exposure
+) -> None:
+    """And clipped after that, as the camera does it."""
+    re_exposed = exposed(run, sequence, rasterizer, exposure)
+    value = {name: metric.value for name, metric in evaluate(run, re_exposed, rasterizer).metrics.items()}
+    assert value["psnr_withheld"] > 90.0 and value["psnr_withheld_mapped"] > 90.0
+    assert value["ssim_withheld"] > 0.999
+    change = [
+        (drawn_at(run, row, rasterizer).clamp(0, 1) - frame.color)[frame.valid]
+        for row, frame in zip(run.trajectory()[0].rows, re_exposed.frames, strict=True)
+        if row.frame_index in (1, 3, 5)
+    ]
+    unexposed = float(np.mean([-10 * np.log10(float(part.square().mean())) for part in change]))
+    assert value["psnr_withheld_unexposed"] == pytest.approx(unexposed, abs=0.01)
+    assert unexposed < 24.0
+
+
+def test_keyframes_are_drawn_as_exposed_beside_their_mean(run: RunDirectory, rasterizer: Rasterizer) -> None:
+    for index in range(2):
+        submap = run.load_submap(index)
+        keyframes = []
+        for keyframe, gain in zip(submap.keyframes, (0.8, 1.25), strict=True):  # of mean 1
+            color = gain * seen(submap, 0, keyframe.T_map_cam, rasterizer).frame.color
+            frame = replace(keyframe.frame, color=color.clamp(0, 1))
+            keyframes.append(replace(keyframe, frame=frame, exposure=Exposure(2 * gain)))
+        run.write_submap(replace(submap, keyframes=tuple(keyframes)))
+    assert evaluate(run, None, rasterizer).metrics["psnr"].value > 50.0  # all that parts them is rounding to 8 bits
+
+
+def test_the_contact_sheet_shows_the_map_as_exposed(
+    run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer
+) -> None:
+    re_exposed = exposed(run, sequence, rasterizer, Exposure(0.5, 0.1))
+    sheets = [figures.contact_sheet_of(run, re_exposed, rasterizer, columns=3, width=400)]
+    exposed(run, sequence, rasterizer, Exposure())
+    sheets.append(figures.contact_sheet_of(run, re_exposed, rasterizer, columns=3, width=400))
+    tile = (len(sheets[0]) - 36 - 12 - 3 * 6) // 4
+    inner = slice(0, tile * 4 // 5), slice(34, -80)  # of the first row of tiles, without the border of the pictures
+    apart = [np.abs(np.diff([sheet[36:][inner], sheet[36 + tile + 6 :][inner]], axis=0)) for sheet in np.int64(sheets)]
+    assert apart[0].mean() < 3.0 < 20.0 < apart[1].mean()
 
 
 def test_withheld_are_frames_neither_mapped_nor_lost(

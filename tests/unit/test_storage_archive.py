@@ -13,6 +13,7 @@ from tcgsplat.errors import ArchiveError
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.scene.atlas import Atlas
+from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
@@ -27,6 +28,12 @@ def random_pose(generator: torch.Generator) -> torch.Tensor:
     return se3.exp(torch.randn(6, dtype=torch.float64, generator=generator))
 
 
+def random_exposure(generator: torch.Generator) -> Exposure:
+    """With more digits than float32 has."""
+    gain, offset = (0.5 + torch.rand(2, dtype=torch.float64, generator=generator)).tolist()
+    return Exposure(gain, offset - 1.0)
+
+
 def random_keyframe(index: int, generator: torch.Generator, farthest: float = 5.0) -> Keyframe:
     depth = torch.rand(24, 32, generator=generator) * farthest
     depth[:3] = 0.0
@@ -39,7 +46,7 @@ def random_keyframe(index: int, generator: torch.Generator, farthest: float = 5.
         valid=torch.rand(24, 32, generator=generator) > 0.2,
         camera=CAMERA,
     )
-    return Keyframe(frame, random_pose(generator))
+    return Keyframe(frame, random_pose(generator), random_exposure(generator))
 
 
 def random_submap(index: int, generator: torch.Generator, n: int = 17, sh_degree: int = 1) -> Submap:
@@ -73,6 +80,7 @@ def assert_same_submap(a: Submap, b: Submap, depth_tolerance: float = 1.01e-4) -
             torch.testing.assert_close(getattr(ours, field.name), getattr(theirs, field.name), rtol=0, atol=0)
     for one, two in zip(a.keyframes, b.keyframes, strict=True):
         torch.testing.assert_close(one.T_map_cam, two.T_map_cam, rtol=0, atol=0)
+        assert one.exposure == two.exposure
         assert (one.frame.index, one.frame.timestamp, one.frame.camera) == (
             two.frame.index, two.frame.timestamp, two.frame.camera,
         )  # fmt: skip
@@ -166,9 +174,12 @@ def test_run_directory_comes_back(tmp_path: Path, generator: torch.Generator) ->
         run.write_submap(submap)
     atlas = Atlas(tuple(submap.T_world_map for submap in submaps))
     rows = tuple(
-        TrackedPose(2 * i, 1e9 + i / 30, i // 2, random_pose(generator), lost=i == 3, mapped=i in (0, 4))
+        TrackedPose(
+            2 * i, 1e9 + i / 30, i // 2, random_pose(generator),
+            lost=i == 3, mapped=i in (0, 4), exposure=random_exposure(generator),
+        )
         for i in range(6)
-    )
+    )  # fmt: skip
     run.write_trajectory(Trajectory(rows), atlas)
     run.write_summary({"frames": 6, "seconds": 0.5})
 
@@ -178,8 +189,9 @@ def test_run_directory_comes_back(tmp_path: Path, generator: torch.Generator) ->
     for i, submap in enumerate(submaps):
         assert_same_submap(again.load_submap(i), submap)
     read, read_atlas = again.trajectory()
-    assert [(r.frame_index, r.timestamp, r.submap_index, r.lost, r.mapped) for r in read.rows] == [
-        (r.frame_index, r.timestamp, r.submap_index, r.lost, r.mapped) for r in rows
+    names = ("frame_index", "timestamp", "submap_index", "lost", "mapped", "exposure")
+    assert [[getattr(row, name) for name in names] for row in read.rows] == [
+        [getattr(row, name) for name in names] for row in rows
     ]
     for one, two in zip(read.world(read_atlas), Trajectory(rows).world(atlas), strict=True):
         assert torch.equal(one, two)
@@ -190,13 +202,37 @@ def test_run_directory_comes_back(tmp_path: Path, generator: torch.Generator) ->
         torch.testing.assert_close(one, two, rtol=0, atol=1e-12)
 
 
+def without(path: Path, kind: str, *endings: str) -> None:
+    """Rewrite an archive without the entries whose names end so, as an older tcgsplat wrote it."""
+    arrays = archive.read_arrays(path, kind)
+    kept = {name: array for name, array in arrays.items() if not name.endswith(("kind", "version", *endings))}
+    assert len(kept) < len(arrays) - 2
+    archive.write_arrays(path, kind, kept)
+
+
+def test_pictures_of_an_older_run_are_as_they_came(tmp_path: Path, generator: torch.Generator) -> None:
+    run = RunDirectory.create(tmp_path / "a", config_toml="", sequence="")
+    submap = random_submap(0, generator)
+    run.write_submap(submap)
+    rows = tuple(TrackedPose(i, 0.1 * i, 0, random_pose(generator), exposure=Exposure(0.7, 0.1)) for i in range(2))
+    run.write_trajectory(Trajectory(rows), Atlas((submap.T_world_map,)))
+    without(run.path / "submaps" / "0000.npz", "submap", ".exposure")
+    without(run.path / "trajectory.npz", "trajectory", "exposure")
+
+    read = run.load_submap(0)
+    as_they_came = tuple(dataclasses.replace(keyframe, exposure=UNCHANGED) for keyframe in submap.keyframes)
+    assert_same_submap(read, dataclasses.replace(submap, keyframes=as_they_came))
+    for keyframe in read.keyframes:
+        assert torch.equal(read.balanced(keyframe).color, keyframe.frame.color)
+    assert [row.exposure for row in run.trajectory()[0].rows] == [UNCHANGED, UNCHANGED]
+    assert torch.equal(run.trajectory()[0].rows[1].T_map_cam, rows[1].T_map_cam)
+
+
 def test_trajectory_of_an_older_run_names_no_mapped_frame(tmp_path: Path, generator: torch.Generator) -> None:
     run = RunDirectory.create(tmp_path / "a", config_toml="", sequence="")
     rows = (TrackedPose(0, 0.0, 0, random_pose(generator), mapped=True), TrackedPose(1, 0.1, 0, random_pose(generator)))
     run.write_trajectory(Trajectory(rows), Atlas((random_pose(generator),)))
-    columns = archive.read_arrays(run.path / "trajectory.npz", "trajectory")
-    del columns["mapped"], columns["kind"], columns["version"]
-    archive.write_arrays(run.path / "trajectory.npz", "trajectory", columns)
+    without(run.path / "trajectory.npz", "trajectory", "mapped")
     read, _ = run.trajectory()
     assert [row.mapped for row in read.rows] == [False, False]
     assert torch.equal(read.rows[1].T_map_cam, rows[1].T_map_cam)

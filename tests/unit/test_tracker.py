@@ -6,16 +6,19 @@ from dataclasses import replace
 
 import pytest
 import torch
-from analytic_room import Room, errors, pose
+from analytic_room import CAMERA, Room, errors, pose, rendering_of
 from torch import Tensor
 
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
 from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.render.view import render_view
+from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
-from tcgsplat.tracking.alignment import AlignmentConfig
+from tcgsplat.tensors import Pose
+from tcgsplat.tracking.alignment import AlignmentConfig, align
 from tcgsplat.tracking.descent import DescentConfig
 from tcgsplat.tracking.tracker import Tracker, TrackerConfig
 
@@ -106,6 +109,81 @@ def test_exposure_does_not_lose_a_frame(room: Room, corner: Submap, rasterizer: 
     tracked = tracker(rasterizer).track(brighter, corner, se3.identity())
     assert tracked.converged
     assert errors(tracked.T_map_cam, T_TRUE)[0] < 6
+
+
+def seen_at(T_map_cam: Pose, exposure: Exposure, corner: Submap, rasterizer: Rasterizer) -> tuple[Frame, Tensor]:
+    """What the map itself shows there, exposed so and not clipped; and its colours before."""
+    rendering = render_view(corner, CAMERA, T_map_cam, rasterizer)
+    frame = replace(Room().frame(T_map_cam), color=exposure.applied(rendering.color), depth=rendering.depth)
+    return frame, rendering.color
+
+
+EXPOSURES = [
+    UNCHANGED, Exposure(0.7), Exposure(0.7, 0.1), Exposure(0.85, -0.05), Exposure(1.2, 0.05), Exposure(1.4, -0.1),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("exposure", EXPOSURES, ids=str)
+def test_the_exposure_of_a_picture_of_the_map(exposure: Exposure, corner: Submap, rasterizer: Rasterizer) -> None:
+    frame, before = seen_at(T_TRUE, exposure, corner, rasterizer)
+    found = tracker(rasterizer).track(frame, corner, T_TRUE).exposure
+    middle = float(before.mean())
+    assert found.gain * middle + found.offset == pytest.approx(exposure.gain * middle + exposure.offset, abs=0.004)
+    # What keeps flat pictures at a gain of 1 pulls these towards it, by a tenth, around their mean.
+    assert found.gain == pytest.approx(exposure.gain, abs=0.002 + 0.12 * abs(exposure.gain - 1))
+    assert (found.applied(before) - frame.color).abs().mean() < 0.001 + 0.015 * abs(exposure.gain - 1)
+
+
+@pytest.mark.parametrize("exposure", EXPOSURES, ids=str)
+def test_the_exposure_does_not_move_the_camera(exposure: Exposure, corner: Submap, rasterizer: Rasterizer) -> None:
+    frame, before = seen_at(T_TRUE, exposure, corner, rasterizer)
+    tracked = tracker(rasterizer).track(frame, corner, se3.identity())
+    plain = tracker(rasterizer).track(replace(frame, color=before), corner, se3.identity())
+    assert tracked.converged
+    assert errors(tracked.T_map_cam, T_TRUE)[0] < 1.7 and errors(tracked.T_map_cam, T_TRUE)[1] < 0.12
+    assert errors(tracked.T_map_cam, plain.T_map_cam)[0] < 0.5
+    assert tracked.correlation == pytest.approx(plain.correlation, abs=0.01)
+    # From 2 cm away, a view of the map is compared with a picture that was sampled between its pixels.
+    assert (tracked.exposure.applied(before) - frame.color).abs().mean() < 0.008 + 0.015 * abs(exposure.gain - 1)
+
+
+def test_saturated_colours_are_told_by_the_rest(corner: Submap, rasterizer: Rasterizer) -> None:
+    """A gain of 1.2 makes a sixtieth of the picture white, which looks like a little less gain and some offset."""
+    frame, before = seen_at(T_TRUE, Exposure(1.2), corner, rasterizer)
+    assert 0.01 < float((frame.color > 1).float().mean()) < 0.05
+    clipped = replace(frame, color=frame.color.clamp(0, 1))
+    tracked = tracker(rasterizer).track(clipped, corner, se3.identity())
+    assert errors(tracked.T_map_cam, T_TRUE)[0] < 1.7
+    found = tracker(rasterizer).track(clipped, corner, T_TRUE).exposure
+    assert found.gain == pytest.approx(1.2, abs=0.04)
+    assert (found.applied(before).clamp(0, 1) - clipped.color).abs().mean() < 0.006
+
+
+@pytest.mark.parametrize("alpha", [0.75, 0.9])
+def test_only_what_is_all_but_opaque_tells_the_exposure(alpha: float) -> None:
+    """Half of the view is thin: its composited colours are darker than the surface, and its divided ones lighter."""
+    frame = Room().frame()
+    thin = torch.zeros_like(frame.valid)
+    thin[:, 40:] = True
+    view = rendering_of(frame, alpha=torch.where(thin, alpha, 1.0))
+    for shown in (0.0, 0.5):  # behind the thin half, black or grey shows through
+        color = torch.where(thin[..., None], alpha * frame.color + (1 - alpha) * shown, frame.color)
+        found = align(
+            replace(frame, color=color), view, torch.ones_like(frame.depth), se3.identity(), AlignmentConfig()
+        )
+        assert (found.exposure.gain, found.exposure.offset) == pytest.approx((1.0, 0.0), abs=0.005)
+
+
+@pytest.mark.parametrize("config", [replace(ALIGNMENT, exposure=False), DESCENT], ids=["switched off", "descent"])
+def test_who_finds_no_exposure_takes_pictures_as_they_come(
+    config: TrackerConfig, corner: Submap, rasterizer: Rasterizer
+) -> None:
+    frame, _ = seen_at(T_TRUE, Exposure(0.7, 0.1), corner, rasterizer)
+    assert tracker(rasterizer, config).track(frame, corner, T_TRUE).exposure == UNCHANGED
+    with_it, without = (
+        tracker(rasterizer, replace(config, exposure=switch)).track(frame, corner, T_TRUE) for switch in (True, False)
+    )
+    assert torch.equal(with_it.T_map_cam, without.T_map_cam)  # nor does the pose feel the switch
 
 
 def test_flat_walls_are_no_reason_to_be_lost(rasterizer: Rasterizer, corner: Submap) -> None:
