@@ -21,6 +21,7 @@ from tcgsplat.mapping.schedule import Schedule
 from tcgsplat.mapping.seeding import IdSource
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.atlas import Atlas
+from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory
@@ -29,6 +30,10 @@ from tcgsplat.tracking.delay import DepthDelay
 from tcgsplat.tracking.motion import ConstantVelocity
 from tcgsplat.tracking.synchronization import synchronized
 from tcgsplat.tracking.tracker import Tracked, Tracker
+
+EXPOSURE_LEAK = 0.01
+"""How much nearer to 1 a keyframe's exposure is taken than it was found. Each is found beside a map that was made with
+those before it; an error of theirs that is always the same adds up to a hundred times itself, not more."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,8 @@ class Reference:
     submap: Submap
     T_map_reference: Pose = field(default_factory=se3.identity)
     """The reference's frame in that of the active submap."""
+    exposure: Exposure = UNCHANGED
+    """As the active submap shows what the reference shows."""
 
 
 class Slam:
@@ -124,7 +131,7 @@ class Slam:
         with self._core():
             together = synchronized(frame, velocity) if self._synchronizes else frame
             tracked = self._tracked(together, guess=self.motion.predict(frame.timestamp))
-        T_map_cam = tracked.T_map_cam
+        T_map_cam, exposure = tracked.T_map_cam, tracked.exposure
         advance = self.motion.advanced if tracked.converged else self.motion.coasted
         self.motion = advance(T_map_cam, frame.timestamp)
         if self._learns_delay and tracked.converged and tracked.color and tracked.depth:
@@ -141,13 +148,13 @@ class Slam:
             if fresh is not None:  # all that follows hangs on this pose: it is found again in the newest map
                 update, anchor = fresh, self._tracked(together, guess=T_map_cam)
                 tracked = anchor if anchor.converged else tracked
-                T_map_cam = tracked.T_map_cam
+                T_map_cam, exposure = tracked.T_map_cam, tracked.exposure
                 clock.lap("track")
             sealed = self.submap.sealed(self.config.confidence)
-            self._reference = Reference(self.submap, se3.inverse(T_map_cam))
+            self._reference = Reference(self.submap, se3.inverse(T_map_cam), tracked.exposure)
             self.submap = self._anchored(self.submap.T_world_map @ T_map_cam, index=len(self.atlas))
             self.atlas = self.atlas.with_submap(self.submap.T_world_map)
-            self.motion, T_map_cam = self.motion.rebased(), se3.identity()
+            self.motion, T_map_cam, exposure = self.motion.rebased(), se3.identity(), UNCHANGED
 
         # Map: grow where the view is new, and have it all optimised and judged while the next frames are tracked.
         maps = may_map and self._schedule.maps(self._since_mapped, self.submap)
@@ -156,7 +163,7 @@ class Slam:
             clock.lap("wait")
             with self._core():
                 together = synchronized(frame, self.motion.steady) if self._synchronizes else frame
-                grown = self._mapper.grown(Keyframe(together, T_map_cam, tracked.exposure), self.submap)
+                grown = self._mapper.grown(Keyframe(together, T_map_cam, exposure.relaxed(EXPOSURE_LEAK)), self.submap)
             self.submap, self._since_mapped = grown.submap, 0
             if not grown.first or not len(self._reference.submap):
                 self._refer_to(self.submap)
@@ -174,7 +181,7 @@ class Slam:
             T_map_cam=T_map_cam,
             lost=not tracked.converged,
             mapped=maps,
-            exposure=tracked.exposure,
+            exposure=exposure,
         )
         self.trajectory = self.trajectory.with_row(row)
         return StepReport(
@@ -194,10 +201,15 @@ class Slam:
         return self.submap.sealed(self.config.confidence) if self.submap.keyframes else None
 
     def _tracked(self, frame: Frame, guess: Pose) -> Tracked:
-        """The frame's pose in the active submap, found in the reference."""
-        T_map_reference = self._reference.T_map_reference
-        tracked = self._tracker.track(frame, self._reference.submap, se3.inverse(T_map_reference) @ guess)
-        return replace(tracked, T_map_cam=T_map_reference @ tracked.T_map_cam)
+        """The frame's pose and exposure in the active submap, found in the reference."""
+        reference = self._reference
+        T_map_reference = reference.T_map_reference
+        tracked = self._tracker.track(frame, reference.submap, se3.inverse(T_map_reference) @ guess)
+        return replace(
+            tracked,
+            T_map_cam=T_map_reference @ tracked.T_map_cam,
+            exposure=tracked.exposure.relative_to(reference.exposure),
+        )
 
     def _updated(self, grown: Grown) -> tuple[Submap, MapUpdate]:
         """Optimise (equations 20 to 24), then judge what moved (equations 4 to 15); runs beside tracking."""

@@ -97,8 +97,8 @@ def test_unequal_exposures_are_balanced_alike(submap: Submap) -> None:
     """Both compare with the pictures as the map keeps them, and both feel it."""
     plain = submap.keyframes[1]
     exposed = replace(submap, keyframes=(submap.keyframes[0], replace(plain, exposure=Exposure(0.7, 0.05))))
-    frames = tuple(replace(keyframe, frame=exposed.balanced(keyframe)) for keyframe in exposed.keyframes)
-    assert exposed.balanced(exposed.keyframes[1]).color.max() > 1  # nor is it clipped
+    frames = tuple(replace(keyframe, frame=keyframe.balanced) for keyframe in exposed.keyframes)
+    assert exposed.keyframes[1].balanced.color.max() > 1  # nor is it clipped
     by_hand = replace(submap, keyframes=tuple(replace(k, exposure=Exposure()) for k in frames))
     results = []
     for each in (exposed, by_hand, submap):
@@ -110,7 +110,7 @@ def test_unequal_exposures_are_balanced_alike(submap: Submap) -> None:
             results.append((losses, optimization.submap().gaussians))
     (slow, slow_map), (fast, fast_map), (_, slow_by_hand), (_, fast_by_hand), (unfelt, _), _ = results
     assert fast == pytest.approx(slow, rel=2e-5)
-    assert all(abs(a - b) > 0.02 * b for a, b in zip(slow, unfelt, strict=True))
+    assert all(abs(a - b) > 0.02 * b for a, b in zip(slow[1:], unfelt[1:], strict=True))  # at view 1
     for name in PARAMETERS:
         assert torch.equal(getattr(slow_map, name), getattr(slow_by_hand, name))
         assert torch.equal(getattr(fast_map, name), getattr(fast_by_hand, name))

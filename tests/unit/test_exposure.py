@@ -93,6 +93,15 @@ def test_the_mean_of_equals_is_they_and_order_does_not_matter(
     assert close(mean(exposures), mean(exposures[::-1]))
 
 
+@repeatable
+@given(exposure=exposures, share=st.floats(0.0, 1.0))
+def test_relaxing_goes_a_share_of_the_way_to_none(exposure: Exposure, share: float) -> None:
+    relaxed = exposure.relaxed(share)
+    assert math.log(relaxed.gain) == pytest.approx((1 - share) * math.log(exposure.gain), abs=1e-12)
+    assert relaxed.offset == pytest.approx((1 - share) * exposure.offset, abs=1e-12)
+    assert exposure.relaxed(0.0) == exposure and close(exposure.relaxed(1.0), UNCHANGED)
+
+
 def test_a_frame_without_its_exposure_is_the_same_but_for_colour(room: Room) -> None:
     frame = room.frame()
     exposure = Exposure(1.3, -0.1)

@@ -26,6 +26,7 @@ from tcgsplat.evaluation.views import (
 )
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import MIN_COVERAGE, render_view
+from tcgsplat.scene import exposure
 from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory, parse_tum
 from tcgsplat.storage import atomic
@@ -114,7 +115,8 @@ def evaluate(
     - `ate_rmse`, cm: camera centres of all tracked frames that have a true pose, after rigid alignment.
     - `psnr_withheld` (dB), `ssim_withheld`, `depth_l1_withheld` (cm): frames of the sequence that were tracked and
       never mapped, drawn at the pose and with the exposure that tracking found for them.
-    - `psnr_withheld_unexposed` (dB): the same in the map's own colours, as systems without exposures score.
+    - `psnr_withheld_unexposed` (dB): the same with one exposure for all views of a submap, the mean of its keyframes',
+      as systems without exposures score.
     - `psnr_withheld_mapped` (dB), `coverage_withheld` (%): the PSNR of those of their valid pixels that the map covers
       by more than half, and the share of these: the rest is what holes cost.
     - `psnr` (dB), `ssim`, `depth_l1` (cm), `depth_coverage` (%): the keyframes, which the map was optimised on.
@@ -167,7 +169,7 @@ def evaluate(
             "withheld": _told_withheld(trajectory, len(withheld), len(drawn) if sequence is not None else 0),
             "views": f"{'all keyframes' if stride == 1 else f'one keyframe in {stride}'} of the saved submaps: "
             "training views; these and the withheld ones are each drawn from their own submap",
-            "poses": "estimated, and so are exposures (psnr_withheld_unexposed: none)",
+            "poses": "estimated, and so are exposures (psnr_withheld_unexposed: one for a submap)",
             "pixels": "psnr and ssim: valid pixels, without the border that undistortion leaves empty; "
             f"psnr_withheld_mapped: those with alpha above {MIN_COVERAGE:g}; "
             "depth_l1: those with a sensor reading, unmapped ones in full",
@@ -271,9 +273,10 @@ def _quality(
         submap = run.load_submap(index)
         rows = [row for row in withheld if row.submap_index == index]
         unseen = withheld_views(rows, velocities, sequence, delay) if sequence is not None else iter(())
+        middle = exposure.mean([keyframe.exposure for keyframe in submap.keyframes] or [exposure.UNCHANGED])
         for view in in_turn(training_views(submap, slice(-seen % stride, None, stride)), unseen):
             rendering = render_view(submap, view.frame.camera, view.T_map_cam, rasterizer)
-            scores[view.withheld].append(ViewScore.of(rendering, view))
+            scores[view.withheld].append(ViewScore.of(rendering, view, middle))
             drawn(view.frame.index)
         gaussians += len(submap)
         seen += len(submap.keyframes)

@@ -44,7 +44,7 @@ class ViewScore:
     psnr: float
     """dB, over the valid pixels."""
     psnr_unexposed: float
-    """dB, as if the picture's exposure were not known: the map's own colours; what other systems call PSNR."""
+    """dB, as if no picture's exposure were known: with the one in the middle of the submap's keyframes for all."""
     ssim: float
     """Over the windows of valid pixels."""
     depth_l1: float
@@ -57,14 +57,14 @@ class ViewScore:
     """Percent of the valid pixels that are covered so."""
 
     @staticmethod
-    def of(rendering: Rendering, view: PosedFrame) -> "ViewScore":
-        """The score of a rendering from where the view's frame was taken."""
+    def of(rendering: Rendering, view: PosedFrame, middle: Exposure) -> "ViewScore":
+        """The score of a rendering from where the view's frame was taken; `middle` is the submap's mean exposure."""
         frame, depth = view.frame, rendering.depth
         color = view.exposure.applied(rendering.color).clamp(0.0, 1.0)
         mapped, read = rendering.alpha > MIN_COVERAGE, frame.valid & (frame.depth > 0)
         return ViewScore(
             psnr=images.psnr(color, frame.color, frame.valid),
-            psnr_unexposed=images.psnr(rendering.color.clamp(0.0, 1.0), frame.color, frame.valid),
+            psnr_unexposed=images.psnr(middle.applied(rendering.color).clamp(0.0, 1.0), frame.color, frame.valid),
             ssim=images.ssim(color, frame.color, frame.valid),
             depth_l1=100.0 * images.depth_l1(depth, frame.depth, read),
             depth_coverage=100.0 * float((depth[read] > 0).to(depth.dtype).mean()),
@@ -104,7 +104,7 @@ def spread(rows: tuple[TrackedPose, ...], number: int) -> tuple[TrackedPose, ...
 def training_views(submap: Submap, places: slice) -> Iterator[PosedFrame]:
     """Keyframes of a submap, those at some places of their order."""
     return (
-        PosedFrame(keyframe.frame, keyframe.T_map_cam, submap.exposure(keyframe), withheld=False)
+        PosedFrame(keyframe.frame, keyframe.T_map_cam, keyframe.exposure, withheld=False)
         for keyframe in submap.keyframes[places]
     )
 

@@ -30,7 +30,7 @@ class Grown:
     @property
     def frame(self) -> Frame:
         """The frame that was taken in, its colours as the map keeps them."""
-        return self.submap.balanced(self.submap.keyframes[-1])
+        return self.submap.keyframes[-1].balanced
 
 
 @dataclass(frozen=True)
@@ -73,13 +73,12 @@ class Mapper:
 
     def grown(self, keyframe: Keyframe, submap: Submap) -> Grown:
         """The submap with a new keyframe taken in."""
-        first, T_map_cam = not submap.keyframes, keyframe.T_map_cam
-        rendering = None if first else render_view(submap, keyframe.frame.camera, T_map_cam, self._rasterizer)
-        keyframes = thinned((*submap.keyframes, keyframe), self._config.max_keyframes)
-        submap = replace(submap, keyframes=keyframes)
-        frame = submap.balanced(keyframe)
+        first, frame, T_map_cam = not submap.keyframes, keyframe.balanced, keyframe.T_map_cam
+        rendering = None if first else render_view(submap, frame.camera, T_map_cam, self._rasterizer)
         seeds = seed(frame, T_map_cam, rendering, submap.gaussians, self._ids, self._generator, self._config.seeding)
-        return Grown(submap.grown(seeds, self._confidence), len(seeds), first)
+        keyframes = thinned((*submap.keyframes, keyframe), self._config.max_keyframes)
+        grown = replace(submap.grown(seeds, self._confidence), keyframes=keyframes)
+        return Grown(grown, len(seeds), first)
 
     def optimized(self, grown: Grown) -> Mapped:
         """The grown submap, optimised over its keyframes."""

@@ -17,7 +17,6 @@ from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.losses import SSIM_C1, SSIM_C2, ssim_window
 from tcgsplat.render.numba_cpu.layout import CHANNELS, FEATURE, PARAMETERS, Floats, aligned
 from tcgsplat.render.numba_cpu.passes import Passes, Workspace
-from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag
@@ -38,7 +37,8 @@ def covers(submap: Submap, config: MapperConfig, confidence: ConfidenceConfig) -
 class _View:
     """A keyframe as the kernels read it."""
 
-    def __init__(self, keyframe: Keyframe, frame: Frame) -> None:
+    def __init__(self, keyframe: Keyframe) -> None:
+        frame = keyframe.balanced
         self.camera = frame.camera
         self.T_cam_map = se3.inverse(keyframe.T_map_cam).numpy()
         self.color: Floats = np.ascontiguousarray(frame.color.permute(2, 0, 1).numpy())
@@ -123,8 +123,7 @@ class NativeOptimization:
 
     def _view(self, index: int) -> _View:
         if index not in self._views:
-            keyframe = self._submap.keyframes[index]
-            self._views[index] = _View(keyframe, self._submap.balanced(keyframe))
+            self._views[index] = _View(self._submap.keyframes[index])
         return self._views[index]
 
     def _differentiated_losses(self, view: _View, planes: Floats) -> Floats:

@@ -77,7 +77,7 @@ class AutogradOptimization:
 
     def step(self, view: int, frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
         """See `Optimization`."""
-        frame, gaussians = self._submap.balanced(self._submap.keyframes[view]), self._adam.gaussians
+        frame, gaussians = self._submap.keyframes[view].balanced, self._adam.gaussians
         rendering = render(
             gaussians, self._submap.confidence.value, frame.camera, self._T_cam_map[view], self._rasterizer
         )

@@ -31,14 +31,18 @@ class Exposure:
         gain = self.gain / other.gain
         return Exposure(gain, self.offset - gain * other.offset)
 
+    def relaxed(self, share: float) -> "Exposure":
+        """A little nearer to no change, by a share of the way."""
+        return Exposure(self.gain ** (1.0 - share), self.offset * (1.0 - share))
+
 
 UNCHANGED = Exposure()
 
 
 def mean(exposures: Sequence[Exposure]) -> Exposure:
-    """The exposure in the middle: geometric in gain."""
+    """The exposure in the middle, geometric in gain; of at least one."""
     n = len(exposures)
     return Exposure(
-        math.exp(sum(math.log(exposure.gain) for exposure in exposures) / n),
+        math.prod(exposure.gain for exposure in exposures) ** (1.0 / n),
         sum(exposure.offset for exposure in exposures) / n,
     )

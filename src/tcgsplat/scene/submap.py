@@ -9,7 +9,7 @@ import torch
 
 from tcgsplat.confidence.state import ConfidenceConfig, ConfidenceState
 from tcgsplat.geometry import se3
-from tcgsplat.scene.exposure import UNCHANGED, Exposure, mean
+from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.tensors import PerGaussianFlag, Pose
@@ -17,12 +17,16 @@ from tcgsplat.tensors import PerGaussianFlag, Pose
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A frame kept for mapping, with its pose in the submap and its exposure beside the map's."""
+    """A frame kept for mapping, with its pose in the submap and its exposure beside the submap's."""
 
     frame: Frame
     T_map_cam: Pose
     exposure: Exposure = UNCHANGED
-    """As tracking found it, beside the map of that time."""
+
+    @property
+    def balanced(self) -> Frame:
+        """The frame with its colours as the map keeps them: what mapping compares with."""
+        return self.frame.unexposed(self.exposure)
 
 
 @dataclass(frozen=True)
@@ -51,18 +55,6 @@ class Submap:
 
     def __len__(self) -> int:
         return len(self.gaussians)
-
-    def exposure(self, keyframe: Keyframe) -> Exposure:
-        """A keyframe's exposure beside this map, whose brightness is the mean of its keyframes'.
-
-        Were the map's the first picture's, each exposure would be measured on a map made with those before it, and
-        their errors would add up: the synthetic room, never re-exposed, lost half its brightness in 600 frames.
-        """
-        return keyframe.exposure.relative_to(mean([keyframe.exposure for keyframe in self.keyframes]))
-
-    def balanced(self, keyframe: Keyframe) -> Frame:
-        """A keyframe's frame with its colours as the map keeps them: what mapping compares with."""
-        return keyframe.frame.unexposed(self.exposure(keyframe))
 
     def grown(self, new: Gaussians, config: ConfidenceConfig) -> "Submap":
         """With new Gaussians appended; their confidence is born at this submap's clock."""
