@@ -24,7 +24,7 @@ from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.scene.trajectory import TrackedPose
-from tcgsplat.slam import Slam, StepReport
+from tcgsplat.slam import EXPOSURE_LEAK, Slam, StepReport
 from tcgsplat.storage.run_directory import RunDirectory
 from tcgsplat.tensors import Pose
 
@@ -158,6 +158,17 @@ def test_each_frame_is_as_much_brighter_as_it_is(name: str, walked: Callable[...
     assert len(pairs) > 12 and np.abs(pairs[:, 0]).max() > 0.03
     np.testing.assert_allclose(pairs[:, 1], pairs[:, 0], atol=0.04)
     assert max(errors(T, true)[0] for T, true in zip(result.T_world_cam, way, strict=True)) < 15  # mm, of 50 cm
+
+
+def test_a_keyframe_has_the_exposure_that_it_was_tracked_with(walked: Callable[..., Run]) -> None:
+    """But for the leak; a submap begins with the brightness of its first picture."""
+    result = walked("jumping")
+    keyframes = [keyframe for submap in result.submaps for keyframe in submap.keyframes]
+    mapped = [row for row in result.rows if row.mapped]
+    assert [k.exposure for k in keyframes] == [row.exposure.relaxed(EXPOSURE_LEAK) for row in mapped]
+    assert np.ptp([grey(keyframe.exposure) for keyframe in keyframes]) > 0.15
+    for submap in result.submaps:
+        assert next(row for row in mapped if row.submap_index == submap.index).exposure == UNCHANGED
 
 
 @pytest.mark.parametrize(("name", "decibels"), [("waving", 1), ("jumping", 5)])

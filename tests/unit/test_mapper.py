@@ -19,6 +19,7 @@ from tcgsplat.mapping.seeding import IdSource, SeedingConfig
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import render_view
+from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.tensors import Pose
@@ -84,6 +85,22 @@ def moved(update: Mapped) -> tuple[Tensor, Tensor]:
     """How far the survivors' centres went along each axis, and their rows before."""
     rows = torch.searchsorted(update.before.ids, update.submap.gaussians.ids)
     return (update.submap.gaussians.means - update.before.means[rows]).abs(), rows
+
+
+def test_a_picture_is_taken_in_as_the_map_keeps_it(room: Room, young: Submap, rasterizer: Rasterizer) -> None:
+    """New surface has the same colours, however it was exposed; the picture itself is kept as it came."""
+    T_new, exposure = pose(degrees=(0, 50, 0)), Exposure(0.64, 0.05)
+    frame = room.frame(T_new)
+    dark = replace(frame, color=exposure.applied(frame.color))
+    grown = [
+        Mapper(CONFIG, UNGUIDED, rasterizer, IdSource(5000), torch.Generator().manual_seed(0)).grown(keyframe, young)
+        for keyframe in (Keyframe(dark, T_new, exposure), Keyframe(frame, T_new))
+    ]
+    balanced, plain = (each.submap.gaussians.sh[-each.seeded :] for each in grown)
+    assert len(balanced) > 300
+    torch.testing.assert_close(balanced, plain, atol=2e-5, rtol=0)
+    torch.testing.assert_close(grown[0].frame.color, frame.color, atol=2e-6, rtol=0)
+    assert torch.equal(grown[0].submap.keyframes[-1].frame.color, dark.color)
 
 
 class TestOptimisation:
