@@ -232,6 +232,19 @@ def test_withheld_views_are_drawn_as_exposed(
     assert unexposed < 24.0
 
 
+def test_unexposed_views_are_drawn_with_the_mean_of_the_keyframes(
+    run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer
+) -> None:
+    re_exposed = exposed(run, sequence, rasterizer, Exposure(0.8, 0.05))
+    for index in range(2):
+        submap = run.load_submap(index)
+        around = zip(submap.keyframes, (Exposure(0.64, 0.1), Exposure(1.0, 0.0)), strict=True)
+        keyframes = tuple(replace(keyframe, exposure=exposure) for keyframe, exposure in around)
+        run.write_submap(replace(submap, keyframes=keyframes))
+    metrics = evaluate(run, re_exposed, rasterizer).metrics
+    assert metrics["psnr_withheld_unexposed"].value > 90.0 and metrics["psnr_withheld"].value > 90.0
+
+
 def test_keyframes_are_drawn_as_exposed(run: RunDirectory, rasterizer: Rasterizer) -> None:
     for index in range(2):
         submap = run.load_submap(index)
