@@ -8,7 +8,16 @@ from numba import njit
 
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.numba_cpu import pass_kernels
-from tcgsplat.render.numba_cpu.layout import LOG2_OPACITY, MEAN, PARAMETERS, QUAT, SCALE, aligned
+from tcgsplat.render.numba_cpu.layout import (
+    LOG2_OPACITY,
+    MEAN,
+    PARAMETERS,
+    QUAT,
+    SCALE,
+    aligned,
+    from_blocks,
+    to_blocks,
+)
 from tcgsplat.render.numba_cpu.passes import Passes
 from tcgsplat.render.numba_cpu.phases import COUNTERS, OVER, WAITING, next_unit
 from tcgsplat.render.numba_cpu.workers import Workers
@@ -20,14 +29,16 @@ THREADS = (1, 2, 3, 7)
 def parameters(n: int, seed: int, nearest: float = 0.1, farthest: float = 4.0) -> np.ndarray:
     """Random splats, many at the very same depth, some behind, some as large as many tiles."""
     rng = np.random.default_rng(seed)
-    P = aligned((PARAMETERS, n))
+    P = np.empty((PARAMETERS, n), np.float32)
     z = np.round(rng.uniform(nearest, farthest, n), 1 if farthest < 10 else -1)
     P[MEAN : MEAN + 3] = rng.uniform(-0.8, 0.8, n) * z, rng.uniform(-0.6, 0.6, n) * z, z
     P[QUAT : QUAT + 4] = rng.normal(size=(4, n))
     P[SCALE : SCALE + 3] = rng.uniform(0.005, 0.03, (3, n)) * np.where(rng.random(n) < 0.02, 20, 1) * np.maximum(z, 0.2)
     P[LOG2_OPACITY] = np.log2(rng.uniform(0.002, 0.99, n))
     P[LOG2_OPACITY + 1 :] = rng.uniform(size=(4, n))
-    return P
+    blocks = aligned((n // 16, PARAMETERS, 16))
+    to_blocks(blocks, P.T)
+    return blocks
 
 
 def passed(passes: Passes, P: np.ndarray) -> list[np.ndarray]:
@@ -104,7 +115,7 @@ def test_a_pass_that_is_kept_is_not_overwritten_and_one_that_is_dropped_gives_it
 
 
 def test_derivatives_go_where_the_caller_wants_them():
-    P, passes, grads = parameters(1008, 7), Passes(2), aligned((PARAMETERS, 1008))
+    P, passes, grads = parameters(1008, 7), Passes(2), aligned((63, PARAMETERS, 16))
     expected = passed(passes, P)
     drawn = passes.draw(P, CAMERA, np.eye(4))
     d_planes = np.cos(np.arange(drawn.planes.size, dtype=np.float32)).reshape(drawn.planes.shape)
@@ -154,3 +165,13 @@ def test_workers_raise_what_a_helper_raises_and_wait_for_all():
 
 def test_a_unit_is_whole_vectors():
     assert pass_kernels.UNIT % 16 == 0
+
+
+@pytest.mark.parametrize("n", [1, 15, 16, 17, 48])
+def test_blocks_hold_sixteen_rows_of_a_table_side_by_side(n: int) -> None:
+    table = np.arange(5 * n, dtype=np.float32).reshape(n, 5)
+    blocks = np.full((-(-n // 16), 5, 16), -1, np.float32)
+    to_blocks(blocks, table)
+    assert all(blocks[i // 16, k, i % 16] == table[i, k] for i in range(n) for k in range(5))
+    assert (blocks == -1).sum() == 5 * (-n % 16)
+    np.testing.assert_array_equal(from_blocks(blocks)[:n], table)

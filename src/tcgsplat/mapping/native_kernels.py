@@ -1,6 +1,6 @@
 """Adam on rows of Gaussians, without autograd; the losses are in `loss_kernels.py`.
 
-Parameters are rows of one float32 matrix [ROWS, n padded to 16], in the order of the rasterizer's own matrix; what
+Parameters are in blocks [blocks, ROWS, 16] like the rasterizer's own, and in the same order; what
 `optimizer.RowAdam` and `optimization.AutogradOptimization` say in torch is said here sixteen Gaussians at a time.
 """
 
@@ -11,7 +11,7 @@ from numba import njit
 
 from tcgsplat.mapping.optimizer import BETA_1, BETA_2, EPSILON
 from tcgsplat.render.numba_cpu.compilation import kept
-from tcgsplat.render.numba_cpu.layout import FEATURE, LOG2_OPACITY, MEAN, QUAT, SCALE
+from tcgsplat.render.numba_cpu.layout import FEATURE, LOG2_OPACITY, MEAN, PARAMETERS, QUAT, SCALE
 from tcgsplat.render.numba_cpu.phases import WAITING, next_unit
 from tcgsplat.render.numba_cpu.simd import (
     INNER,
@@ -56,32 +56,32 @@ _TINY = np.float32(1e-24)
 
 
 @kept(njit(**KERNEL))
-def activate(raw, P, n, start, stop):
+def activate(raw, P, start, stop):
     """The rasterizer's parameters from raw ones, for a range: what `Gaussians` calls scales, opacities and colors."""
     for i in range(start, stop, 16):
         for row in range(MEAN, QUAT + 4):
-            store(P, row * n + i, load(raw, row * n + i))
+            store(P, PARAMETERS * i + 16 * row, load(raw, ROWS * i + 16 * row))
         for row in range(LOG_SCALE, LOG_SCALE + 3):
-            store(P, row * n + i, exp2(load(raw, row * n + i) * _LOG2E))
-        logit = maximum(minimum(load(raw, LOGIT * n + i), spread(_STEEPEST)), spread(-_STEEPEST))
+            store(P, PARAMETERS * i + 16 * row, exp2(load(raw, ROWS * i + 16 * row) * _LOG2E))
+        logit = maximum(minimum(load(raw, ROWS * i + 16 * LOGIT), spread(_STEEPEST)), spread(-_STEEPEST))
         opacity = spread(_ZERO) - log2(exp2(logit * (-_LOG2E)) + _ONE)
-        store(P, LOGIT * n + i, minimum(opacity, spread(_LOG2_MAX_OPACITY)))
+        store(P, PARAMETERS * i + 16 * LOGIT, minimum(opacity, spread(_LOG2_MAX_OPACITY)))
         for row in range(SH, SH + 3):
-            store(P, row * n + i, maximum(fma(load(raw, row * n + i), spread(_C0), spread(_HALF)), spread(_ZERO)))
+            store(P, PARAMETERS * i + 16 * row, maximum(fma(load(raw, ROWS * i + 16 * row), spread(_C0), spread(_HALF)), spread(_ZERO)))
 
 
 @kept(njit(**INNER))
-def _changes(raw, before, n, i):
+def _changes(raw, before, i):
     """Of sixteen Gaussians: d_mu (Eq. 5), d_s (Eq. 6), the cosine between quaternions, and their inverse lengths."""
     one, moved, stretched = spread(_ONE), spread(_ZERO), spread(_ZERO)
     for k in range(3):
-        d = load(raw, (MEAN + k) * n + i) - load(before, (MEAN + k) * n + i)
+        d = load(raw, ROWS * i + 16 * (MEAN + k)) - load(before, ROWS * i + 16 * (MEAN + k))
         moved = fma(d, d, moved)
-        d = load(raw, (LOG_SCALE + k) * n + i) - load(before, (LOG_SCALE + k) * n + i)
+        d = load(raw, ROWS * i + 16 * (LOG_SCALE + k)) - load(before, ROWS * i + 16 * (LOG_SCALE + k))
         stretched = fma(d, d, stretched)
     product, length, length_before = spread(_ZERO), spread(_TINY), spread(_TINY)
     for k in range(4):
-        q, q0 = load(raw, (QUAT + k) * n + i), load(before, (QUAT + k) * n + i)
+        q, q0 = load(raw, ROWS * i + 16 * (QUAT + k)), load(before, ROWS * i + 16 * (QUAT + k))
         product, length, length_before = fma(q, q0, product), fma(q, q, length), fma(q0, q0, length_before)
     inverse, inverse_before = one / sqrt(length), one / sqrt(length_before)
     return sqrt(moved), sqrt(stretched), product * inverse * inverse_before, inverse, inverse_before
@@ -98,15 +98,15 @@ def _distance(moved, stretched, cosine, constants):
 def self_distances(raw, before, n, constants, out):
     """How far each Gaussian is from where it was before the update (Eq. 8), metres."""
     for i in range(0, n, 16):
-        moved, stretched, cosine, _, _ = _changes(raw, before, n, i)
+        moved, stretched, cosine, _, _ = _changes(raw, before, i)
         store(out, i, _distance(moved, stretched, cosine, constants))
 
 
 @kept(njit(**INNER))
-def _adam_step(n, start, stop, raw, P, before, first, second, clocks, grads, visible, allowed, scale, constants, excess):
+def _adam_step(start, stop, raw, P, before, first, second, clocks, grads, visible, allowed, scale, constants, excess):
     """One Adam step of the visible Gaussians of a range, on the losses of the pixels and of Eq. 23.
 
-    `grads` holds the derivatives by `P`; they are led on to the raw parameters. `clocks` are two rows: what is left of
+    `grads` holds the derivatives by `P`; they are led on to the raw parameters. `clocks` are two rows a block: what is left of
     beta^t of either moment, for each Gaussian's own count t of steps. `allowed` is the self-distance up to which
     Eq. 23 costs nothing (infinite where it does not apply), `scale` the factor of Eq. 24 on the geometry's steps;
     `excess` receives what Eq. 23 sums for each Gaussian, in metres.
@@ -118,14 +118,14 @@ def _adam_step(n, start, stop, raw, P, before, first, second, clocks, grads, vis
         if mask_ge(seen, one) == 0:
             store(excess, i, zero)
             continue
-        power_1, power_2 = load(clocks, i) * _BETA_1, load(clocks, n + i) * _BETA_2
-        store(clocks, i, where_ge(seen, one, power_1, load(clocks, i)))
-        store(clocks, n + i, where_ge(seen, one, power_2, load(clocks, n + i)))
+        power_1, power_2 = load(clocks, 2 * i) * _BETA_1, load(clocks, 2 * i + 16) * _BETA_2
+        store(clocks, 2 * i, where_ge(seen, one, power_1, load(clocks, 2 * i)))
+        store(clocks, 2 * i + 16, where_ge(seen, one, power_2, load(clocks, 2 * i + 16)))
         young_1, young_2 = one / (one - power_1), one / (one - power_2)
         geometry = load(scale, i)
 
         # Eq. 8 between now and before the update, and where it exceeds what is allowed, its derivative.
-        moved, stretched, cosine, inverse, inverse_before = _changes(raw, before, n, i)
+        moved, stretched, cosine, inverse, inverse_before = _changes(raw, before, i)
         distance = _distance(moved, stretched, cosine, constants)
         limit = load(allowed, i)
         store(excess, i, where_ge(limit, distance, zero, distance - limit) * seen)
@@ -135,19 +135,19 @@ def _adam_step(n, start, stop, raw, P, before, first, second, clocks, grads, vis
         by_turn = pull * constants[ROTATION_WEIGHT] * cosine * inverse * _TWO
 
         for row in range(ROWS):
-            at = row * n + i
-            value, g = load(raw, at), load(grads, at)
+            at, at_P = ROWS * i + 16 * row, PARAMETERS * i + 16 * row
+            value, g = load(raw, at), load(grads, at_P)
             if row < QUAT:
                 g = fma(by_mean, value - load(before, at), g)
             elif row < LOG_SCALE:
                 g = fma(by_turn, cosine * inverse * value - load(before, at) * inverse_before, g)
             elif row < LOGIT:
-                g = fma(by_scale, value - load(before, at), g * load(P, at))
+                g = fma(by_scale, value - load(before, at), g * load(P, at_P))
             elif row == LOGIT:
                 # d log2 sigmoid(x) = (1 - sigmoid(x)) log2(e) dx; where opacity is clipped, nothing.
-                g = where_ge(value, spread(_MAX_LOGIT), zero, g * (one - exp2(load(P, at))) * _LOG2E)
+                g = where_ge(value, spread(_MAX_LOGIT), zero, g * (one - exp2(load(P, at_P))) * _LOG2E)
             else:
-                g = where_ge(zero, load(P, at), zero, g * _C0)
+                g = where_ge(zero, load(P, at_P), zero, g * _C0)
             g = where_ge(spread(_HUGE), maximum(g, zero - g), g, zero)  # NaN compares as false
             m = fma(load(first, at), spread(_BETA_1), g * _REST_1)
             v = fma(load(second, at), spread(_BETA_2), g * g * _REST_2)
@@ -157,7 +157,7 @@ def _adam_step(n, start, stop, raw, P, before, first, second, clocks, grads, vis
             store(first, at, where_ge(seen, one, m, load(first, at)))
             store(second, at, where_ge(seen, one, v, load(second, at)))
             store(raw, at, where_ge(seen, one, value - step, value))
-        activate(raw, P, n, i, i + 16)
+        activate(raw, P, i, i + 16)
 
 
 @kept(njit(**KERNEL))
@@ -169,35 +169,8 @@ def adam_step(
     k = next_unit(progress, 0, units, 0)
     while k >= 0:
         _adam_step(
-            n, k * UNIT, min((k + 1) * UNIT, n), raw, P, before, first, second, clocks, grads, visible, allowed, scale,
+            k * UNIT, min((k + 1) * UNIT, n), raw, P, before, first, second, clocks, grads, visible, allowed, scale,
             constants, excess,
         )
         k = next_unit(progress, 0, units, 1)
     return k != WAITING
-
-
-@kept(njit(**KERNEL))
-def pack(means, quats, log_scales, logits, sh, matrix):
-    """Tables of parameters to the rows of a matrix."""
-    for i in range(means.shape[0]):
-        for k in range(3):
-            matrix[MEAN + k, i] = means[i, k]
-            matrix[LOG_SCALE + k, i] = log_scales[i, k]
-            matrix[SH + k, i] = sh[i, 0, k]
-        for k in range(4):
-            matrix[QUAT + k, i] = quats[i, k]
-        matrix[LOGIT, i] = logits[i]
-
-
-@kept(njit(**KERNEL))
-def unpack(matrix, rows, means, quats, log_scales, logits, sh):
-    """The matrix' columns named by `rows`, back to tables."""
-    for j in range(rows.size):
-        i = rows[j]
-        for k in range(3):
-            means[j, k] = matrix[MEAN + k, i]
-            log_scales[j, k] = matrix[LOG_SCALE + k, i]
-            sh[j, 0, k] = matrix[SH + k, i]
-        for k in range(4):
-            quats[j, k] = matrix[QUAT + k, i]
-        logits[j] = matrix[LOGIT, i]

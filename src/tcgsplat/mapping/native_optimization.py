@@ -15,7 +15,16 @@ from tcgsplat.mapping import loss_kernels
 from tcgsplat.mapping import native_kernels as kernels
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.losses import SSIM_C1, SSIM_C2, ssim_window
-from tcgsplat.render.numba_cpu.layout import CHANNELS, FEATURE, PARAMETERS, Floats, aligned
+from tcgsplat.render.numba_cpu.layout import (
+    CHANNELS,
+    FEATURE,
+    PARAMETERS,
+    QUAT,
+    Floats,
+    aligned,
+    from_blocks,
+    to_blocks,
+)
 from tcgsplat.render.numba_cpu.passes import Passes, Workspace
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
@@ -60,12 +69,11 @@ class NativeOptimization:
         self._raw = packed(self._padded, g.means, g.quats, g.log_scales, g.logit_opacities, g.sh)
         self._before = filled(0.0, *self._raw.shape)
         self._before[:] = self._raw
-        self._parameters: Floats = aligned((PARAMETERS, self._padded))  # type: ignore[assignment]
-        self._parameters[FEATURE + 3] = 0.0
-        self._parameters[FEATURE + 3, :n] = submap.confidence.value.numpy()
-        kernels.activate(_flat(self._raw), _flat(self._parameters), self._padded, 0, self._padded)
+        self._parameters = filled(0.0, self._padded // 16, PARAMETERS, 16)
+        to_blocks(self._parameters[:, FEATURE + 3 :], submap.confidence.value.numpy()[:, None])
+        kernels.activate(_flat(self._raw), _flat(self._parameters), 0, self._padded)
         self._first, self._second = (filled(0.0, *self._raw.shape) for _ in range(2))
-        self._clocks = filled(1.0, 2, self._padded)
+        self._clocks = filled(1.0, self._padded // 16, 2, 16)
         self._counted = self._row(0.0, self._has_history())
         self._allowed = self._row(np.inf, self._allowed_distance())
         self._scale = self._row(1.0, self._step_scale())
@@ -81,7 +89,8 @@ class NativeOptimization:
         target = self._view(view)
         drawn = self._passes.draw(self._parameters, target.camera, target.T_cam_map)
         d_planes = self._differentiated_losses(target, drawn.planes)
-        grads, _ = self._passes.differentiate(drawn, d_planes, self._space.floats("grads", PARAMETERS, self._padded))
+        grads = self._space.floats("grads", *self._parameters.shape)
+        self._passes.differentiate(drawn, d_planes, grads)
         self._visible[:] = drawn.visible
         self._stability_weight = self._confidence.stability_weight / self._count()
         arrays = (
@@ -93,8 +102,9 @@ class NativeOptimization:
 
     def prune(self) -> None:
         """See `Optimization`. Rows stay where they are until the end; a faint one is simply never drawn again."""
-        self._raw[kernels.LOGIT, ~self._kept()] = _FAINT
-        kernels.activate(_flat(self._raw), _flat(self._parameters), self._padded, 0, self._padded)
+        logits = self._raw[:, kernels.LOGIT]
+        logits[~(1.0 / (1.0 + np.exp(-logits)) >= self._config.min_opacity)] = _FAINT  # what is not a number goes too
+        kernels.activate(_flat(self._raw), _flat(self._parameters), 0, self._padded)
 
     @property
     def loss(self) -> float:
@@ -105,7 +115,7 @@ class NativeOptimization:
         """See `Optimization`."""
         submap, rows = self._submap, self._survivors()
         if len(rows) < len(submap):
-            submap = submap.kept(torch.from_numpy(self._raw[kernels.LOGIT, : len(submap)] > _FAINT))
+            submap = submap.kept(torch.from_numpy(self._survives()))
         return replace(submap, gaussians=_gaussians(self._raw, rows, submap.gaussians))
 
     def self_distance(self) -> PerGaussian:
@@ -115,11 +125,10 @@ class NativeOptimization:
         return torch.from_numpy(distances[self._survivors()])
 
     def _survivors(self) -> npt.NDArray[np.int64]:
-        return np.flatnonzero(self._raw[kernels.LOGIT, : len(self._submap)] > _FAINT)
+        return np.flatnonzero(self._survives())
 
-    def _kept(self) -> npt.NDArray[np.bool_]:
-        opacity = 1.0 / (1.0 + np.exp(-self._raw[kernels.LOGIT]))
-        return np.asarray(opacity >= self._config.min_opacity, np.bool_)
+    def _survives(self) -> npt.NDArray[np.bool_]:
+        return self._raw[:, kernels.LOGIT].reshape(-1)[: len(self._submap)] > _FAINT
 
     def _view(self, index: int) -> _View:
         if index not in self._views:
@@ -223,26 +232,27 @@ def _rates(config: MapperConfig) -> Floats:
 
 
 def packed(padded: int, *tables: torch.Tensor) -> Floats:
-    """Raw parameters as rows [ROWS, padded], from means, quats, log scales, logits and harmonics; padding is too faint
-    to be drawn.
+    """Raw parameters in blocks [blocks, ROWS, 16], from means, quats, log scales, logits and harmonics; what fills the
+    last block up is too faint to be drawn.
     """
-    matrix = filled(1.0, kernels.ROWS, padded)
-    matrix[kernels.LOGIT] = _FAINT
-    kernels.pack(*(np.ascontiguousarray(table.detach().numpy()) for table in tables), matrix)
-    return matrix
+    blocks, row = filled(1.0, padded // 16, kernels.ROWS, 16), 0
+    blocks[-1, kernels.LOGIT] = _FAINT
+    for table in tables:
+        columns = table.detach().reshape(len(table), -1).numpy()
+        to_blocks(blocks[:, row : row + columns.shape[1]], columns)
+        row += columns.shape[1]
+    return blocks
 
 
-def _gaussians(matrix: Floats, rows: npt.NDArray[np.int64], template: Gaussians) -> Gaussians:
-    """Some of the columns as Gaussians with the template's ids."""
-    n = len(rows)
-    means, quats, log_scales = (np.empty((n, width), np.float32) for width in (3, 4, 3))
-    logits, sh = np.empty(n, np.float32), np.empty((n, 1, 3), np.float32)
-    kernels.unpack(matrix, rows, means, quats, log_scales, logits, sh)
+def _gaussians(blocks: Floats, rows: npt.NDArray[np.int64], template: Gaussians) -> Gaussians:
+    """Some of the lanes as Gaussians with the template's ids."""
+    table = from_blocks(blocks)[rows]
+    means, quats, log_scales, logits, sh = np.split(table, (QUAT, kernels.LOG_SCALE, kernels.LOGIT, kernels.SH), axis=1)
     return replace(
         template,
-        means=torch.from_numpy(means),
-        quats=torch.from_numpy(quats),
-        log_scales=torch.from_numpy(log_scales),
-        logit_opacities=torch.from_numpy(logits),
-        sh=torch.from_numpy(sh),
+        means=torch.from_numpy(means.copy()),
+        quats=torch.from_numpy(quats.copy()),
+        log_scales=torch.from_numpy(log_scales.copy()),
+        logit_opacities=torch.from_numpy(logits[:, 0].copy()),
+        sh=torch.from_numpy(sh[:, None].copy()),
     )

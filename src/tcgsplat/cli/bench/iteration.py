@@ -7,7 +7,7 @@ import numpy as np
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.mapping import native_kernels as kernels
 from tcgsplat.mapping.native_optimization import filled, packed
-from tcgsplat.render.numba_cpu.layout import CHANNELS, FEATURE, PARAMETERS, Floats, aligned
+from tcgsplat.render.numba_cpu.layout import CHANNELS, FEATURE, PARAMETERS, Floats, to_blocks
 from tcgsplat.render.numba_cpu.passes import Drawn, Passes, Workspace
 from tcgsplat.render.protocol import Splats
 from tcgsplat.scene.gaussians import SH_C0
@@ -26,14 +26,13 @@ class Iteration:
         self._padded = -(-n // 16) * 16
         sh = (splats.features[:, None, :3] - 0.5) / SH_C0
         self.raw = packed(self._padded, splats.means, splats.quats, splats.scales.log(), splats.opacities.logit(), sh)
-        self.parameters: Floats = aligned((PARAMETERS, self._padded))  # type: ignore[assignment]
-        self.parameters[FEATURE + 3] = 0.0
-        self.parameters[FEATURE + 3, :n] = splats.features[:, 3].numpy()
-        kernels.activate(self.raw.reshape(-1), self.parameters.reshape(-1), self._padded, 0, self._padded)
+        self.parameters = filled(0.0, self._padded // 16, PARAMETERS, 16)
+        to_blocks(self.parameters[:, FEATURE + 3 :], splats.features[:, 3:].numpy())
+        kernels.activate(self.raw.reshape(-1), self.parameters.reshape(-1), 0, self._padded)
         self._before = filled(0.0, *self.raw.shape)
         self._before[:] = self.raw
         self.first, self.second = filled(0.0, *self.raw.shape), filled(0.0, *self.raw.shape)
-        self._clocks = filled(1.0, 2, self._padded)
+        self._clocks = filled(1.0, self._padded // 16, 2, 16)
         self._allowed, self._scale = filled(np.inf, self._padded), filled(1.0, self._padded)
         self._constants: Floats = np.zeros(kernels.CONSTANTS, np.float32)
         self._excess, self._visible = filled(0.0, self._padded), filled(0.0, self._padded)
@@ -43,9 +42,8 @@ class Iteration:
     def step(self) -> None:
         """Draw, differentiate, and Adam for what was drawn."""
         drawn = self.draw()
-        grads, _ = self._passes.differentiate(
-            drawn, self._d_planes, self._space.floats("grads", PARAMETERS, self._padded)
-        )
+        grads = self._space.floats("grads", *self.parameters.shape)
+        self._passes.differentiate(drawn, self._d_planes, grads)
         self._visible[:] = drawn.visible
         arrays = (
             self._padded, self.raw.reshape(-1), self.parameters.reshape(-1), self._before.reshape(-1),

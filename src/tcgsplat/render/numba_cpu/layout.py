@@ -1,7 +1,8 @@
 """Memory layouts that the kernels share.
 
-Parameters come in as rows of one aligned float32 matrix [PARAMETERS, n padded to 16] (structure of arrays: projection
-runs sixteen Gaussians at a time). A projected splat is a record of sixteen floats, one cache line. Images live in
+Parameters come in as one aligned float32 array [blocks, PARAMETERS, 16]: sixteen Gaussians make a block, and each of a
+block's rows is one parameter of all sixteen, as a vector holds them. A block's rows lie side by side, so that a kernel
+walks through memory once and not along PARAMETERS rows at a time, which no processor asks for in advance. A projected splat is a record of sixteen floats, one cache line. Images live in
 tiles of 16 x 16 pixels, each tile as CHANNELS planes, each plane as sixteen blocks of 4 x 4 pixels, each block one
 vector: small splats touch few blocks, and a block's lanes are used well whatever the splat's shape.
 """
@@ -13,7 +14,7 @@ Floats = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int32]
 Counts = npt.NDArray[np.uint32]
 
-# Rows of the parameter matrix.
+# Rows of a block of parameters.
 MEAN, QUAT, SCALE, LOG2_OPACITY, FEATURE = 0, 3, 7, 10, 11
 FEATURES = 4
 PARAMETERS = FEATURE + FEATURES
@@ -54,7 +55,22 @@ def aligned(shape: int | tuple[int, ...], dtype: npt.DTypeLike = np.float32) -> 
     return raw[offset : offset + count * dtype.itemsize].view(dtype).reshape(shape)
 
 
-# Lane k of a block is pixel (k % 4, k // 4); block b of a tile begins at pixel (4 (b % 4), 4 (b // 4)).
+def to_blocks(blocks: Floats, table: npt.NDArray[np.float32]) -> None:
+    """Write a table [n, k] to the first n lanes of blocks [m, k, 16]; what comes after them stays."""
+    n, k = table.shape
+    whole = n // 16
+    blocks[:whole] = table[: 16 * whole].reshape(whole, 16, k).transpose(0, 2, 1)
+    if n % 16:
+        blocks[whole, :, : n % 16] = table[16 * whole :].T
+
+
+def from_blocks(blocks: Floats) -> Floats:
+    """The table [16 m, k] of blocks [m, k, 16]."""
+    m, k, _ = blocks.shape
+    return blocks.transpose(0, 2, 1).reshape(16 * m, k)
+
+
+# Lane k of a block of pixels is pixel (k % 4, k // 4); block b of a tile begins at pixel (4 (b % 4), 4 (b // 4)).
 LANE_GRID: Floats = np.concatenate(
     [
         np.arange(16) % BLOCK,

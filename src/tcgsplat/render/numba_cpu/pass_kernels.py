@@ -65,7 +65,7 @@ def arrange(
             unit, unit_after = units * k // strips, units * (k + 1) // strips
             if phase == PROJECT:
                 start, stop = k * UNIT, min((k + 1) * UNIT, n)
-                projection.forward(P, n, start, stop, cam, tiles_x, records, depths, rectangles)
+                projection.forward(P, start, stop, cam, tiles_x, records, depths, rectangles)
                 tiling.tally(start, stop, depth_bits, rectangles, unit_sums[k])
             elif phase == LIST:
                 at, slot = _before(unit_sums, unit, 0), _before(unit_sums, unit, 1)

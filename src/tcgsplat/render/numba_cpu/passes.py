@@ -142,12 +142,12 @@ class Passes:
         """Project, sort, bin and composite.
 
         Args:
-            parameters: [PARAMETERS, padded], padded to a multiple of sixteen by splats too faint to be visible.
+            parameters: [blocks, PARAMETERS, 16], filled up by splats too faint to be visible.
             camera: Intrinsics.
             T_cam_map: Map frame to camera frame, [4, 4]; used in float32.
         """
         space = self._workspace()
-        padded, width, height = parameters.shape[1], camera.width, camera.height
+        padded, width, height = 16 * len(parameters), camera.width, camera.height
         cam, flat = camera_vector(camera, T_cam_map), parameters.reshape(-1)
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
         tiles, strips, units = tiles_x * tiles_y, self.workers.threads, -(-padded // kernels.UNIT)
@@ -192,7 +192,7 @@ class Passes:
     def differentiate(
         self, drawn: Drawn, d_planes: Floats, grads: Floats | None = None
     ) -> tuple[Floats, npt.NDArray[np.float64]]:
-        """From the loss's derivative by the planes to those by the parameters [PARAMETERS, padded] and the pose [4, 4].
+        """From the loss's derivative by the planes to those by the parameters [blocks, PARAMETERS, 16] and the pose [4, 4].
 
         `grads` is where to write the former; a new array if left out.
         """
@@ -201,7 +201,7 @@ class Passes:
         pair_sums = space.floats("pair_sums", max(drawn.masks.size, 1) * RECORD)
         pose_sums = space.floats("pose_sums", -(-padded // kernels.UNIT), projection.POSE_SUMS)
         local = space.floats("local", self.workers.threads, BACKWARD_FLOATS)
-        out: Floats = aligned((PARAMETERS, padded)) if grads is None else grads  # type: ignore[assignment]
+        out: Floats = aligned((padded // 16, PARAMETERS, 16)) if grads is None else grads  # type: ignore[assignment]
         blending = (
             drawn.tile_ends, drawn.pairs, drawn.records, drawn.tiles_x, width, height, self._grid, drawn.masks,
             drawn.planes.reshape(-1), d_planes.reshape(-1),

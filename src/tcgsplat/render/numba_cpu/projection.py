@@ -70,9 +70,9 @@ POSE_SUMS = 12
 
 
 @njit(fastmath=MATH, **INNER, inline="always")
-def _expand(P, n, i, cam):
+def _expand(P, i, cam):
     """Centre in the camera, J R, own axes as a rotation, N = J R R(q), N S, and what they are made of."""
-    point = load_rows(P, MEAN * n + i, n, 3)
+    point = load_rows(P, PARAMETERS * i + 16 * MEAN, 16, 3)
     row_x, row_y, row_z = load_spread(cam, ROTATION, 3), load_spread(cam, ROTATION + 3, 3), load_spread(cam, ROTATION + 6, 3)
     x, y = dot(row_x, point) + cam[TRANSLATION], dot(row_y, point) + cam[TRANSLATION + 1]
     z_true = dot(row_z, point) + cam[TRANSLATION + 2]
@@ -88,14 +88,14 @@ def _expand(P, n, i, cam):
         jv * (row_y[0] - b_c * row_z[0]), jv * (row_y[1] - b_c * row_z[1]), jv * (row_y[2] - b_c * row_z[2]),
         row_z[0], row_z[1], row_z[2],
     )  # fmt: skip
-    quat = load_rows(P, QUAT * n + i, n, 4)
+    quat = load_rows(P, PARAMETERS * i + 16 * QUAT, 16, 4)
     inverse_length = _ONE / sqrt(maximum(dot(quat, quat), spread(np.float32(1e-24))))
     w, p, q, r = quat[0] * inverse_length, quat[1] * inverse_length, quat[2] * inverse_length, quat[3] * inverse_length
     w2, p2, q2 = w * _TWO, p * _TWO, q * _TWO
     wp, wq, wr, pp, pq, pr, qq, qr, rr = w2 * p, w2 * q, w2 * r, p2 * p, p2 * q, p2 * r, q2 * q, q2 * r, r * r * _TWO
     Q = _ONE - (qq + rr), pq - wr, pr + wq, pq + wr, _ONE - (pp + rr), qr - wp, pr - wq, qr + wp, _ONE - (pp + qq)
     N = product(J, Q)
-    scales = load_rows(P, SCALE * n + i, n, 3)
+    scales = load_rows(P, PARAMETERS * i + 16 * SCALE, 16, 3)
     return point, (x, y, z_true, z, iz), (a, b, a_c, b_c), (ju, jv), J, (w, p, q, r, inverse_length), Q, N, scales, times_columns(N, scales)
 
 
@@ -111,17 +111,17 @@ def _plane_and_footprint(m):
 
 
 @kept(njit(fastmath=MATH, **INNER))
-def forward(P, n, start, stop, cam, tiles_x, records, depths, rectangles):
+def forward(P, start, stop, cam, tiles_x, records, depths, rectangles):
     """Records, depths (0: not visible) and rectangles of tiles (see `layout.SPAN_UNIT`) of a range."""
     zero, one = spread(_ZERO), spread(_ONE)
     last_x, last_y = load_spread(cam, LAST_PIXEL, 2)
     for i in range(start, stop, 16):
-        _, (_, _, z_true, z, _), (a, b, _, _), _, _, _, _, _, _, m = _expand(P, n, i, cam)
+        _, (_, _, z_true, z, _), (a, b, _, _), _, _, _, _, _, _, m = _expand(P, i, cam)
         (slope_u, slope_v, _, _, _), (bu, bv, uv, inverse) = _plane_and_footprint(m)
         scaled = inverse * _HALF_LOG2E  # the footprint's quadratic form, in log2 units
         A, B, C = bv * scaled, uv * scaled * np.float32(-2), bu * scaled
         u, v = a * cam[FOCAL] + cam[CENTER], b * cam[FOCAL + 1] + cam[CENTER + 1]
-        log2_opacity = load(P, LOG2_OPACITY * n + i)
+        log2_opacity = load(P, PARAMETERS * i + 16 * LOG2_OPACITY)
         # The box around log2 alpha >= log2 MIN_ALPHA, rounded inwards to pixel centres of the image.
         k = (log2_opacity - _LOG2_MIN_ALPHA) * _TWO_LN2
         reach = maximum(k, zero)
@@ -134,7 +134,7 @@ def forward(P, n, start, stop, cam, tiles_x, records, depths, rectangles):
         first, span = top * np.float32(tiles_x) + left, rows * _SPAN_UNIT + columns
         store_int32_pairs(rectangles, 2 * i, where_ge(seen, zero, first, zero), where_ge(seen, zero, span, zero))
         store(depths, i, where_ge(seen, zero, z, zero))
-        f0, f1, f2, f3 = load_rows(P, FEATURE * n + i, n, 4)
+        f0, f1, f2, f3 = load_rows(P, PARAMETERS * i + 16 * FEATURE, 16, 4)
         ridge_y, ridge_x = zero - B / (C * _TWO), zero - B / (A * _TWO)
         store_transposed(
             records, i * RECORD,
@@ -157,7 +157,7 @@ def backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, pose):
     for i in range(start, stop, 16):
         if slot_starts[i] == slot_starts[i + 16]:
             for row in range(PARAMETERS):
-                store(grads, row * n + i, zero)
+                store(grads, PARAMETERS * i + 16 * row, zero)
             continue
         for k in range(16):
             slot, end = np.int64(slot_starts[i + k]), np.int64(slot_starts[i + k + 1])
@@ -172,7 +172,7 @@ def backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, pose):
                 slot += 1
             store(sums, k * RECORD, total)
         s, sx, sy, sxx, sxy, syy, d_f0, d_f1, d_f2, d_f3, d_z, d_plane, plane_x, plane_y, _, _ = load_transposed(sums, 0)
-        point, (_, _, _, _, iz), (a, b, a_c, b_c), (ju, jv), J, (w, p, q, r, inverse_length), Q, N, scales, m = _expand(P, n, i, cam)
+        point, (_, _, _, _, iz), (a, b, a_c, b_c), (ju, jv), J, (w, p, q, r, inverse_length), Q, N, scales, m = _expand(P, i, cam)
         (slope_u, slope_v, au, av, plane_inverse), (bu, bv, uv, inverse) = _plane_and_footprint(m)
         ca, cb, cc = bv * inverse, zero - uv * inverse, bu * inverse
 
@@ -188,7 +188,7 @@ def backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, pose):
         # Covariance m m^T to the scaled axes, to scales and unscaled axes.
         dm = product((d_uu, d_uv, d_uz, d_uv, d_vv, d_vz, d_uz, d_vz, zero), m)
         by_column, axes = transposed(dm), transposed(N)
-        store_rows(grads, SCALE * n + i, n, (dot(by_column[:3], axes[:3]), dot(by_column[3:6], axes[3:6]), dot(by_column[6:], axes[6:])))
+        store_rows(grads, PARAMETERS * i + 16 * SCALE, 16, (dot(by_column[:3], axes[:3]), dot(by_column[3:6], axes[3:6]), dot(by_column[6:], axes[6:])))
         dN = times_columns(dm, scales)
 
         # N = (J R) R(q): to the quaternion ...
@@ -198,7 +198,7 @@ def backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, pose):
         d_q = (p * (h01 + h10) + r * (h12 + h21) + w * (h02 - h20) - q * (h00 + h22) * _TWO) * _TWO
         d_r = (p * (h02 + h20) + q * (h12 + h21) + w * (h10 - h01) - r * (h00 + h11) * _TWO) * _TWO
         along = dot((d_w, d_p, d_q, d_r), (w, p, q, r))  # the length of a quaternion does not matter
-        store_rows(grads, QUAT * n + i, n, (
+        store_rows(grads, PARAMETERS * i + 16 * QUAT, 16, (
             (d_w - along * w) * inverse_length, (d_p - along * p) * inverse_length,
             (d_q - along * q) * inverse_length, (d_r - along * r) * inverse_length,
         ))  # fmt: skip
@@ -215,12 +215,12 @@ def backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, pose):
         d_zc = d_z + d_plane - iz * dot((d_a, d_b, d_ju, d_jv), (a, b, ju, jv))
 
         d_center = d_x, d_y, d_zc
-        store_rows(grads, MEAN * n + i, n, (
+        store_rows(grads, PARAMETERS * i + 16 * MEAN, 16, (
             dot(d_center, (row_x[0], row_y[0], row_z[0])), dot(d_center, (row_x[1], row_y[1], row_z[1])),
             dot(d_center, (row_x[2], row_y[2], row_z[2])),
         ))  # fmt: skip
         # d ln(alpha) = d ln(opacity): the parameter is log2 of it.
-        store_rows(grads, LOG2_OPACITY * n + i, n, (s * _LN2, d_f0, d_f1, d_f2, d_f3))
+        store_rows(grads, PARAMETERS * i + 16 * LOG2_OPACITY, 16, (s * _LN2, d_f0, d_f1, d_f2, d_f3))
 
         X, Y, Z = point
         dj00, dj01, dj02, dj10, dj11, dj12, dj20, dj21, dj22 = dJ

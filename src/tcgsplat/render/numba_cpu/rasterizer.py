@@ -1,7 +1,9 @@
 """The CPU rasterizer: torch values in and out, the kernels' two passes between."""
 
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -19,6 +21,8 @@ from tcgsplat.render.numba_cpu.layout import (
     SCALE,
     Floats,
     aligned,
+    from_blocks,
+    to_blocks,
 )
 from tcgsplat.render.numba_cpu.passes import Passes
 from tcgsplat.render.protocol import Raster, Splats
@@ -26,19 +30,19 @@ from tcgsplat.tensors import PerGaussianFlag, Pose
 
 
 def _packed(splats: Splats) -> Floats:
-    """Parameters as one matrix [PARAMETERS, padded]; padding is too faint to be visible."""
-    n = splats.means.shape[0]
-    padded = -(-max(n, 1) // 16) * 16
-    P: Floats = aligned((PARAMETERS, padded))  # type: ignore[assignment]
-    P[:, n:] = 1.0
-    P[LOG2_OPACITY, n:] = -100.0
-    P[MEAN : MEAN + 3, :n] = splats.means.detach().numpy().T
-    P[QUAT : QUAT + 4, :n] = splats.quats.detach().numpy().T
-    P[SCALE : SCALE + 3, :n] = splats.scales.detach().numpy().T
-    P[LOG2_OPACITY, :n] = splats.opacities.detach().log2().numpy()
-    channels = splats.features.shape[1]
-    P[FEATURE : FEATURE + channels, :n] = splats.features.detach().numpy().T
-    P[FEATURE + channels :, :n] = 0.0
+    """Parameters in blocks [blocks, PARAMETERS, 16]; what fills the last one up is too faint to be visible."""
+    P: Floats = aligned((-(-max(len(splats.means), 1) // 16), PARAMETERS, 16))  # type: ignore[assignment]
+    P[-1] = 1.0
+    P[-1, LOG2_OPACITY] = -100.0
+    P[:, FEATURE:] = 0.0
+    for row, table in (
+        (MEAN, splats.means),
+        (QUAT, splats.quats),
+        (SCALE, splats.scales),
+        (LOG2_OPACITY, splats.opacities.log2()[:, None]),
+        (FEATURE, splats.features),
+    ):
+        to_blocks(P[:, row : row + table.shape[1]], table.detach().numpy())
     return P
 
 
@@ -51,10 +55,12 @@ class NumbaRasterizer:
         """A rasterizer on so many threads of the CPU, by default as many as this process may run on."""
         self.device = torch.device("cpu")
         self.passes = Passes(threads)
+        self._packed: WeakKeyDictionary[Splats, Floats] = WeakKeyDictionary()
 
     def __call__(self, splats: Splats, camera: Camera, T_cam_map: Pose) -> Raster:
-        """Draw; see `Rasterizer`."""
-        groups = torch.split(splats.features, FEATURES, dim=1)
+        """Draw; see `Rasterizer`. The same splats, drawn again without gradients, are not packed again."""
+        whole = splats.features.shape[1] <= FEATURES
+        groups = (splats.features,) if whole else torch.split(splats.features, FEATURES, dim=1)
         planes, visible = self._draw(splats, groups[0], camera, T_cam_map)
         features = [planes[: groups[0].shape[1]]]
         for group in groups[1:]:
@@ -75,8 +81,17 @@ class NumbaRasterizer:
     def _draw(
         self, splats: Splats, features: Tensor, camera: Camera, T_cam_map: Pose
     ) -> tuple[Float[Tensor, "channels h w"], PerGaussianFlag]:
+        tensors = (splats.means, splats.quats, splats.scales, splats.opacities, features, T_cam_map)
+        if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
+            parameters = self._packed.get(splats) if features is splats.features else None
+            if parameters is None:
+                parameters = _packed(replace(splats, features=features))
+                if features is splats.features:
+                    self._packed[splats] = parameters
+            drawn = self.passes.draw(parameters, camera, T_cam_map.to(torch.float64).numpy())
+            return torch.from_numpy(drawn.planes), torch.from_numpy(drawn.visible[: len(splats.means)])
         result: tuple[Tensor, Tensor] = _Draw.apply(  # type: ignore[no-untyped-call]
-            self, camera, splats.means, splats.quats, splats.scales, splats.opacities, features, T_cam_map
+            self, camera, *tensors
         )
         return result
 
@@ -102,13 +117,13 @@ class _Draw(torch.autograd.Function):
     def backward(ctx: Any, d_planes: Tensor, _d_visible: Tensor) -> tuple[Tensor | None, ...]:
         opacities, _ = ctx.saved_tensors
         n, drawn = len(opacities), ctx.drawn
-        grads = drawn.workspace.floats("grads", PARAMETERS, drawn.padded)
+        grads = drawn.workspace.floats("grads", drawn.padded // 16, PARAMETERS, 16)
         _, d_T = ctx.rasterizer.passes.differentiate(drawn, d_planes.contiguous().numpy(), grads)
 
         def rows(start: int, count: int) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(grads[start : start + count, :n].T))
+            return torch.from_numpy(from_blocks(grads[:, start : start + count])[:n])
 
-        d_log2_opacity = torch.from_numpy(grads[LOG2_OPACITY, :n])
+        d_log2_opacity = rows(LOG2_OPACITY, 1)[:, 0]
         return (
             None, None, rows(MEAN, 3), rows(QUAT, 4), rows(SCALE, 3), d_log2_opacity / (opacities * float(np.log(2))),
             rows(FEATURE, ctx.channels), torch.from_numpy(d_T).to(ctx.pose_dtype),
