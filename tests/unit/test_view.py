@@ -1,5 +1,6 @@
 """From Gaussians and a camera to images that mean something."""
 
+import weakref
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
@@ -9,9 +10,10 @@ from analytic_room import CAMERA, Room, pose
 
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.numba_cpu import NumbaRasterizer
 from tcgsplat.render.protocol import MAX_OPACITY, Raster, Rasterizer, Splats
 from tcgsplat.render.reference import ReferenceRasterizer
-from tcgsplat.render.view import MIN_COVERAGE, Rendering, render, render_view
+from tcgsplat.render.view import MIN_COVERAGE, Rendering, SubmapView, render, render_view
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Submap
 
@@ -135,3 +137,29 @@ def test_colour_is_seen_from_the_cameras_own_place() -> None:
         colors.append(recorder.splats[0].features[0, 0].item())
         torch.testing.assert_close(recorder.splats[0].features[:, :3], one(1).colors(T_map_cam[:3, 3].float()))
     assert colors[0] > 0.5 > colors[1]
+
+
+@pytest.mark.parametrize("sh_degree", [0, 1])
+def test_a_submap_drawn_again_looks_as_if_drawn_anew(sh_degree: int, corner: Submap, rasterizer: Rasterizer) -> None:
+    """From elsewhere, where colours that depend on the view are others; and another submap is not mistaken for it."""
+    sh = torch.zeros(len(corner), (sh_degree + 1) ** 2, 3)
+    sh[:, 0] = corner.gaussians.sh[:, 0]
+    sh[:, 1:] = 0.1
+    corner = replace(corner, gaussians=replace(corner.gaussians, sh=sh))
+    moved = replace(corner, gaussians=replace(corner.gaussians, means=corner.gaussians.means + 0.05))
+    views = {"corner": SubmapView(corner, rasterizer), "moved": SubmapView(moved, rasterizer)}
+    for name, T in (("corner", pose(0)), ("moved", pose(0)), ("corner", pose(0.1)), ("moved", pose(0.1))):
+        again, anew = views[name](CAMERA, T), render_view(corner if name == "corner" else moved, CAMERA, T, rasterizer)
+        assert torch.equal(again.color, anew.color) and torch.equal(again.confidence, anew.confidence)
+        assert torch.equal(again.composited_plane_depth, anew.composited_plane_depth)
+        assert torch.equal(again.visible, anew.visible)
+    assert not torch.equal(views["corner"](CAMERA, pose(0)).color, views["moved"](CAMERA, pose(0)).color)
+
+
+def test_what_is_no_longer_drawn_is_forgotten(corner: Submap) -> None:
+    rasterizer, means = NumbaRasterizer(1), corner.gaussians.means.clone()
+    view = SubmapView(replace(corner, gaussians=replace(corner.gaussians, means=means)), rasterizer)
+    view(CAMERA, se3.identity())
+    gone = weakref.ref(means)
+    del view, means
+    assert gone() is None

@@ -34,7 +34,7 @@ JACOBIAN_MARGIN = 0.3
 outside, the linearisation would blow splats up across the whole image."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Splats:
     """Activated Gaussians in the map frame, ready to draw."""
 

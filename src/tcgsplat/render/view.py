@@ -70,11 +70,42 @@ def render(
         T_cam_map: Map frame to camera frame.
         rasterizer: Backend.
     """
+    return _drawn(_splats(gaussians, confidence, T_cam_map), camera, T_cam_map, rasterizer)
+
+
+@torch.no_grad()
+def render_view(submap: Submap, camera: Camera, T_map_cam: Pose, rasterizer: Rasterizer) -> Rendering:
+    """Draw a submap from a camera in its frame, without gradients."""
+    return SubmapView(submap, rasterizer)(camera, T_map_cam)
+
+
+class SubmapView:
+    """A submap to be drawn again and again, without gradients: what no camera changes is done once."""
+
+    def __init__(self, submap: Submap, rasterizer: Rasterizer) -> None:
+        self.submap = submap
+        self._rasterizer = rasterizer
+        self._splats: Splats | None = None
+
+    @torch.no_grad()
+    def __call__(self, camera: Camera, T_map_cam: Pose) -> Rendering:
+        """The view of a camera in the submap's frame."""
+        T_cam_map, submap = se3.inverse(T_map_cam), self.submap
+        splats = self._splats or _splats(submap.gaussians, submap.confidence.value, T_cam_map)
+        if submap.gaussians.sh_degree == 0:  # else colours depend on where they are seen from
+            self._splats = splats
+        return _drawn(splats, camera, T_cam_map, self._rasterizer)
+
+
+def _splats(gaussians: Gaussians, confidence: PerGaussian, T_cam_map: Pose) -> Splats:
     viewpoint = se3.inverse(T_cam_map)[:3, 3].to(gaussians.means)
     features = torch.cat((gaussians.colors(viewpoint), confidence.detach()[:, None]), dim=1)
-    splats = Splats(
+    return Splats(
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities.clamp_max(MAX_OPACITY), features
     )
+
+
+def _drawn(splats: Splats, camera: Camera, T_cam_map: Pose, rasterizer: Rasterizer) -> Rendering:
     raster = rasterizer(splats, camera, T_cam_map)
     return Rendering(
         color=raster.features[..., :3],
@@ -84,9 +115,3 @@ def render(
         confidence=raster.features[..., 3].detach(),
         visible=raster.visible,
     )
-
-
-@torch.no_grad()
-def render_view(submap: Submap, camera: Camera, T_map_cam: Pose, rasterizer: Rasterizer) -> Rendering:
-    """Draw a submap from a camera in its frame, without gradients."""
-    return render(submap.gaussians, submap.confidence.value, camera, se3.inverse(T_map_cam), rasterizer)

@@ -15,7 +15,7 @@ from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.render.view import Rendering, render_view
+from tcgsplat.render.view import Rendering, SubmapView, render_view
 from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
@@ -112,6 +112,7 @@ class Tracker:
         self._config = config
         self._floor = confidence.tracking_floor if confidence.guide_tracking else None
         self._rasterizer = rasterizer
+        self._view: SubmapView | None = None
 
     def track(self, frame: Frame, submap: Submap, guess: Pose) -> Tracked:
         """Pose of `frame` in `submap`, starting from `guess` (`T_map_cam`).
@@ -125,7 +126,7 @@ class Tracker:
             rendering = render_view(submap, frame.camera, found.T_map_cam, self._rasterizer)
             compared = _compared(rendering, frame, self._config.alignment.gate)
             return self._believed(guess, Tracked(found.T_map_cam, "", found.iterations, *compared))
-        rendering = render_view(submap, frame.camera, guess, self._rasterizer)
+        rendering = self._view_of(submap)(frame.camera, guess)
         if self._floor is None:
             weight = torch.ones_like(rendering.confidence)
         else:
@@ -142,6 +143,12 @@ class Tracker:
             depth=aligned.depth,
         )
         return self._believed(guess, tracked)
+
+    def _view_of(self, submap: Submap) -> SubmapView:
+        """Frame after frame is tracked against one submap."""
+        if self._view is None or self._view.submap is not submap:
+            self._view = SubmapView(submap, self._rasterizer)
+        return self._view
 
     def _believed(self, guess: Pose, found: Tracked) -> Tracked:
         """The solver's answer, or the guess and the reason why not."""
