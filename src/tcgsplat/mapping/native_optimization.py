@@ -246,7 +246,9 @@ def packed(padded: int, *tables: torch.Tensor) -> Floats:
 
 def _gaussians(blocks: Floats, rows: npt.NDArray[np.int64], template: Gaussians) -> Gaussians:
     """Some of the lanes as Gaussians with the template's ids."""
-    table = from_blocks(blocks)[rows]
+    table = from_blocks(blocks)
+    none_missing = len(rows) == 0 or rows[-1] == len(rows) - 1
+    table = table[: len(rows)] if none_missing else table[rows]
     means, quats, log_scales, logits, sh = np.split(table, (QUAT, kernels.LOG_SCALE, kernels.LOGIT, kernels.SH), axis=1)
     return replace(
         template,

@@ -27,6 +27,8 @@ Doubles = npt.NDArray[np.float64]
 
 _ENOUGH_FOR_EXPOSURE = 100.0
 """Sum of weights below which gain and offset are left alone: about as many points."""
+_MAX_GAIN = 2.5
+"""Of a picture over its submap's first, and its inverse: two to three stops, since colours are not linear in light."""
 _FLAT_VARIANCE = 0.002
 """Variance of intensity, grey levels squared, that a gain of 1 is worth: an image flatter than that keeps it."""
 _COARSEST = 80
@@ -179,7 +181,7 @@ class _Photometry:
             reference, live = float(sums[kernels.GAIN_R]) / total, float(sums[kernels.GAIN_L]) / total
             variance = float(sums[kernels.GAIN_RR]) / total - reference**2
             covariance = float(sums[kernels.GAIN_RL]) / total - reference * live
-            self.gain = min(1.5, max(0.67, (covariance + _FLAT_VARIANCE) / (variance + _FLAT_VARIANCE)))
+            self.gain = min(_MAX_GAIN, max(1 / _MAX_GAIN, (covariance + _FLAT_VARIANCE) / (variance + _FLAT_VARIANCE)))
             self.offset = live - self.gain * reference
 
 

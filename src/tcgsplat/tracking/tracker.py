@@ -168,5 +168,5 @@ class Tracker:
             elif not found.correlation >= config.min_correlation:  # NaN, too
                 reason = f"its colours correlate by only {found.correlation:.2f} with the map's"
         if reason:
-            return replace(found, T_map_cam=guess, lost=reason)
+            return replace(found, T_map_cam=guess, lost=reason, exposure=UNCHANGED)
         return replace(found, T_map_cam=se3.orthonormalized(found.T_map_cam))
