@@ -15,6 +15,7 @@ import torch
 
 from tcgsplat.config import SlamConfig
 from tcgsplat.geometry import se3
+from tcgsplat.mapping.completion import completed
 from tcgsplat.mapping.feedback import judged
 from tcgsplat.mapping.mapper import Grown, Mapper
 from tcgsplat.mapping.schedule import Schedule
@@ -98,7 +99,7 @@ class Slam:
         """
         self.config = config
         self._live = live
-        self._device, self._core = rasterizer.device, rasterizer.reserved
+        self._rasterizer, self._device, self._core = rasterizer, rasterizer.device, rasterizer.reserved
         generator = torch.Generator().manual_seed(config.seed)
         self._tracker = Tracker(config.tracker, config.confidence, rasterizer)
         self._mapper = Mapper(config.mapper, config.confidence, rasterizer, IdSource(), generator)
@@ -199,6 +200,15 @@ class Slam:
         """The last submap, sealed like all others, or None if nothing was ever mapped."""
         self._finished_update()
         return self.submap.sealed(self.config.confidence) if self.submap.keyframes else None
+
+    def completed(self, sealed: Submap) -> Submap:
+        """A sealed submap with its holes closed by guesses, if the settings say so: for whoever keeps it.
+
+        It takes as long as some frames, reads nothing that changes, and may be called on any thread.
+        """
+        if not self.config.mapper.complete:
+            return sealed
+        return completed(sealed, self.config.mapper.seeding, self.config.confidence, self._rasterizer)
 
     def _tracked(self, frame: Frame, guess: Pose) -> Tracked:
         """The frame's pose and exposure in the active submap, found in the reference."""

@@ -146,7 +146,7 @@ def record(
     observe: Callable[[StepReport, int], object],
     stopped: Callable[[], bool],
 ) -> Summary:
-    """Step SLAM through the frames; each sealed submap and the path so far are written beside the next frames.
+    """Step SLAM through the frames; sealed submaps, completed, and the path so far are written beside the next ones.
 
     Args:
         slam: A fresh system.
@@ -160,21 +160,22 @@ def record(
     """
     tally, gaussians = Tally(), 0
 
-    def write(submap: Submap, trajectory: Trajectory, atlas: Atlas) -> None:
+    def write(sealed: Submap, trajectory: Trajectory, atlas: Atlas) -> int:
+        submap = slam.completed(sealed)
         run.write_submap(submap)
         run.write_trajectory(trajectory, atlas)
+        return len(submap)
 
     started = before = time.perf_counter()
     with ThreadPoolExecutor(1, thread_name_prefix="writer") as writer:
-        writing: Future[None] | None = None
+        writing: Future[int] | None = None
         for arrival in arrivals:
             report = slam.step(arrival.frame)
             tally.follow(arrival, time.perf_counter())
             if report.sealed is not None:
                 if writing is not None:
-                    writing.result()  # one at a time, so that memory holds no more, and no failure is missed
+                    gaussians += writing.result()  # one at a time: memory holds no more, and no failure is missed
                 writing = writer.submit(write, report.sealed, slam.trajectory, slam.atlas)
-                gaussians += len(report.sealed)
             observe(report, arrival.dropped)
             now = time.perf_counter()
             tally.count(report, now - before - arrival.waited)
@@ -182,12 +183,11 @@ def record(
             if stopped():
                 break
         if writing is not None:
-            writing.result()
+            gaussians += writing.result()
     interrupted = stopped()
     last = slam.finish()
     if last is not None:
-        write(last, slam.trajectory, slam.atlas)
-        gaussians += len(last)
+        gaussians += write(last, slam.trajectory, slam.atlas)
     else:
         run.write_trajectory(slam.trajectory, slam.atlas)
     summary = tally.summary(

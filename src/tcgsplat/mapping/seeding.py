@@ -124,7 +124,7 @@ def seed(
     """
     mask = needed(frame, rendering, config)
     if config.recipe == "surface":
-        return _surface_seeds(frame, T_map_cam, mask, existing.sh_degree, ids, config)
+        return surface_seeds(frame, T_map_cam, mask, existing.sh_degree, ids, config)
     return _point_seeds(frame, T_map_cam, mask, rendering is None, existing, ids, generator, config)
 
 
@@ -153,9 +153,10 @@ def _born(
     )
 
 
-def _surface_seeds(
+def surface_seeds(
     frame: Frame, T_map_cam: Pose, mask: Mask, sh_degree: int, ids: IdSource, config: SeedingConfig
 ) -> Gaussians:
+    """Discs in the map frame on what a frame shows at the flagged pixels, all of which must have a depth."""
     height, width = mask.shape
     chosen = mask & _lattice(height, width, config.spacing)
     depth = frame.depth[chosen]

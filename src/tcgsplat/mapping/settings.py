@@ -37,6 +37,9 @@ class MapperConfig:
     max_keyframes: int = 40
     """Keyframes that a submap keeps; redundant ones go first; 0 for all. Bounds memory and the share of old views
     while the camera stays within one submap. [ours] (base: all)"""
+    complete: bool = True
+    """Whether a finished submap gets guessed Gaussians where its pictures show what the sensor could not measure; see
+    `completion`. [ours]"""
     sh_degree: int = 0
     """Degree of the colour's spherical harmonics, 0 to 3. [base]"""
 

@@ -72,7 +72,8 @@ class Gaussians:
     """A set of anisotropic Gaussians in the frame of their submap (Eq. 1), as raw, optimisable parameters."""
 
     ids: Ids
-    """Unique in the run; a Gaussian keeps its id through growing and pruning."""
+    """Unique in the run; a Gaussian keeps its id through growing and pruning. Negative: guessed where the sensor had no
+    reading (`mapping.completion`)."""
     means: Float[Tensor, "n 3"]
     """Centres in the map frame, metres."""
     log_scales: Float[Tensor, "n 3"]

@@ -1,0 +1,88 @@
+"""Closing the holes of a finished submap: what its pictures show and the sensor could not measure.
+
+A structured-light sensor has no reading in the shadow of its own projector, on black and shining things and beyond its
+range. The online map leaves such places open: a guess in it would be tracked against, and stand in front of surfaces
+that a later frame measures. Once a submap is finished nobody tracks against it, and all its frames are there to object.
+"""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import torch
+
+from tcgsplat.confidence.state import ConfidenceConfig, ConfidenceState
+from tcgsplat.geometry import se3
+from tcgsplat.mapping.seeding import IdSource, SeedingConfig, surface_seeds
+from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.render.view import SubmapView
+from tcgsplat.scene.frame import Frame
+from tcgsplat.scene.submap import Keyframe, Submap
+from tcgsplat.tensors import PerGaussianFlag, Plane
+
+_NEIGHBOURHOOD = 1 / 36
+"""Of the image's width: how far about the nearest reading the farthest one is looked for. What hides from the sensor
+lies behind the edge that hides it, and there the readings of both sides are some pixels apart."""
+_BEHIND = 1.02
+"""Times the farthest reading nearby: a guess had better lie behind what was measured than in front of it."""
+
+
+def completed(submap: Submap, config: SeedingConfig, confidence: ConfidenceConfig, rasterizer: Rasterizer) -> Submap:
+    """A finished submap with guessed Gaussians where its keyframes show something that is neither mapped nor measured.
+
+    A guess lies a little behind the farthest reading nearby, in the picture's colour, with the lowest confidence there
+    is. One that any keyframe has measured free space at is not made. All others stay as they are, and so does the
+    order. Guesses have negative ids, unique in a run: nothing else tells them from what was measured.
+
+    Args:
+        submap: Sealed, with its keyframes.
+        config: How dense and how large seeds are, and by how much a reading must lie behind a guess to refute it.
+        confidence: For the lowest one.
+        rasterizer: Backend.
+    """
+    ids, view = IdSource(first=-(submap.index + 1) << 32), SubmapView(submap, rasterizer)
+    for keyframe in submap.keyframes:
+        frame = keyframe.balanced
+        if not frame.has_depth:
+            continue
+        alpha = view(frame.camera, keyframe.T_map_cam).alpha
+        open_ = frame.valid & (frame.depth <= 0) & (alpha < config.min_alpha)
+        if not bool(open_.any()):
+            continue
+        guessed = replace(frame, depth=_guessed_depth(frame))
+        seeds = surface_seeds(guessed, keyframe.T_map_cam, open_, submap.gaussians.sh_degree, ids, config)
+        for other in submap.keyframes:
+            seeds = seeds.kept(~_refuted(seeds.means, other, config.behind))
+        state = ConfidenceState.born_at(submap.clock, len(seeds), confidence)
+        state = replace(state, value=torch.full_like(state.value, confidence.p_min))
+        submap = replace(
+            submap, gaussians=submap.gaussians.appended(seeds), confidence=submap.confidence.appended(state)
+        )
+        view = SubmapView(submap, rasterizer)
+    return submap
+
+
+def _guessed_depth(frame: Frame) -> Plane:
+    """The frame's depth, and where there is none, a little more than the farthest reading about the nearest one."""
+    depth = frame.depth.numpy()
+    missing = depth <= 0
+    _, labels = cv2.distanceTransformWithLabels(
+        missing.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(labels.max() + 1, np.float32)
+    of_label[labels[~missing]] = depth[~missing]
+    reach = max(round(_NEIGHBOURHOOD * frame.camera.width), 1) // 2 * 2 + 1
+    farthest = cv2.dilate(of_label[labels], np.ones((reach, reach), np.uint8))
+    return torch.from_numpy(np.where(missing, np.float32(_BEHIND) * farthest, depth))
+
+
+def _refuted(means: torch.Tensor, keyframe: Keyframe, behind: float) -> PerGaussianFlag:
+    """Which centres [n, 3] in the map frame a keyframe has looked through: it has a reading well behind them."""
+    camera, depth = keyframe.frame.camera, keyframe.frame.depth
+    points = se3.transform(se3.inverse(keyframe.T_map_cam), means)
+    z = points[:, 2]
+    pixels = camera.project(torch.cat((points[:, :2], z.clamp_min(1e-3)[:, None]), dim=1)).round().long()
+    limit = torch.tensor([camera.width, camera.height])
+    inside = (z > 0) & (pixels >= 0).all(dim=1) & (pixels < limit).all(dim=1)
+    u, v = pixels.clamp_min(0).minimum(limit - 1).unbind(dim=1)
+    return inside & (depth[v, u] - z > behind)
