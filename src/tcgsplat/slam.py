@@ -33,8 +33,8 @@ from tcgsplat.tracking.synchronization import synchronized
 from tcgsplat.tracking.tracker import Tracked, Tracker
 
 EXPOSURE_LEAK = 0.01
-"""How much nearer to 1 a keyframe's exposure is taken than it was found. Each is found beside a map that was made with
-those before it; an error of theirs that is always the same adds up to a hundred times itself, not more."""
+"""How much nearer to none a keyframe's exposure is taken than it was found. Each is found beside a map that was made
+with those before it; an error of theirs that is always the same adds up to a hundred times itself, not more."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ class Slam:
         return replace(
             tracked,
             T_map_cam=T_map_reference @ tracked.T_map_cam,
-            exposure=tracked.exposure.relative_to(reference.exposure),
+            exposure=tracked.exposure.relative_to(reference.exposure) if tracked.converged else UNCHANGED,
         )
 
     def _updated(self, grown: Grown) -> tuple[Submap, MapUpdate]:
@@ -227,7 +227,8 @@ class Slam:
         mapped = self._mapper.optimized(grown)
         submap = judged(mapped, grown.frame, self.config.confidence, self.config.mapper.depth_mode)
         seconds = time.perf_counter() - started
-        return submap, MapUpdate(grown.frame.index, grown.seeded, mapped.pruned, mapped.loss, seconds)
+        frame_index = grown.submap.keyframes[-1].frame.index
+        return submap, MapUpdate(frame_index, grown.seeded, mapped.pruned, mapped.loss, seconds)
 
     @property
     def _updates(self) -> bool:

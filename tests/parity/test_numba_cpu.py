@@ -175,3 +175,19 @@ def test_processors_without_wide_vectors_agree_with_the_oracle(features: str, tm
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize("n", [1, 16, 17])
+def test_gradients_belong_to_the_caller(n: int):
+    """A later backward pass leaves them alone, however few splats there are."""
+    rasterizer = NumbaRasterizer(1)
+    inputs = {name: tensor.float() if name != "T_cam_map" else tensor for name, tensor in random_inputs(n, 5).items()}
+    means = inputs["means"].detach().requires_grad_()
+
+    def gradient(weight: float) -> torch.Tensor:
+        return torch.autograd.grad(weight * images(draw(rasterizer, {**inputs, "means": means})).sum(), means)[0]
+
+    first = gradient(1.0)
+    kept = first.clone()
+    gradient(7.0)
+    assert torch.equal(first, kept) and first.abs().max() > 0

@@ -163,3 +163,13 @@ def test_what_is_no_longer_drawn_is_forgotten(corner: Submap) -> None:
     gone = weakref.ref(means)
     del view, means
     assert gone() is None
+
+
+def test_splats_that_were_written_to_are_drawn_as_they_are_now(corner: Submap) -> None:
+    rasterizer, confidence = NumbaRasterizer(1), corner.confidence.value.clone()
+    view = SubmapView(replace(corner, confidence=replace(corner.confidence, value=confidence)), rasterizer)
+    before = view(CAMERA, se3.identity())
+    assert view._splats is not None
+    with torch.no_grad():
+        view._splats.features.mul_(0.5)
+    torch.testing.assert_close(view(CAMERA, se3.identity()).color, 0.5 * before.color)

@@ -116,7 +116,7 @@ def evaluate(
     - `psnr_withheld` (dB), `ssim_withheld`, `depth_l1_withheld` (cm): frames of the sequence that were tracked and
       never mapped, drawn at the pose and with the exposure that tracking found for them.
     - `psnr_withheld_unexposed` (dB): the same with one exposure for all views of a submap, the mean of its keyframes',
-      as systems without exposures score.
+      to compare with systems that have no exposures.
     - `psnr_withheld_mapped` (dB), `coverage_withheld` (%): the PSNR of those of their valid pixels that the map covers
       by more than half, and the share of these: the rest is what holes cost.
     - `psnr` (dB), `ssim`, `depth_l1` (cm), `depth_coverage` (%): the keyframes, which the map was optimised on.

@@ -31,7 +31,7 @@ from tcgsplat.render.numba_cpu.simd import (
 from tcgsplat.render.protocol import MAX_OPACITY
 from tcgsplat.scene.gaussians import SH_C0
 
-# Rows of the raw parameters; the same places as their activations have in the rasterizer's matrix.
+# Rows of the raw parameters; the same places as their activations have in the rasterizer's blocks.
 LOG_SCALE, LOGIT, SH = SCALE, LOG2_OPACITY, FEATURE
 ROWS = SH + 3
 

@@ -213,8 +213,8 @@ class NativeOptimization:
         return np.concatenate((np.float32(pace) * self._rates, np.array(weights, np.float32)))
 
 
-def _flat(matrix: Floats) -> Floats:
-    return matrix.reshape(-1)
+def _flat(array: Floats) -> Floats:
+    return array.reshape(-1)
 
 
 def filled(value: float, *shape: int) -> Floats:

@@ -19,7 +19,8 @@ class ScheduleConfig:
     map_lag: int = 6
     """Frames after which tracking uses what a mapping update made, while the update is worked on beside tracking; 0:
     at once, as the paper has it, with tracking waiting. No later than the next update begins. What is seeded in a
-    submap that has been optimised is tracked against at once in any case. [ours]"""
+    submap that has been optimised is tracked against at once in any case, and a run's first map is waited for. [ours]
+    """
     submap_by: Literal["motion", "interval"] = "motion"
     """What ends a submap: camera motion since its first frame, or a number of frames. [paper]"""
     submap_distance: float = 0.5

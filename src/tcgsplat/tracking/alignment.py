@@ -126,8 +126,6 @@ class _Level:
     """Of the frame, [h, w, CHANNELS]."""
     intrinsics: Floats
     """fx, fy, cx, cy, pixels."""
-    sampling: tuple[int, int]
-    """Radius and stride of the points, pixels."""
     gate: float
     """Metres, times (1 + z/2)."""
 
@@ -138,27 +136,36 @@ def _passes(config: AlignmentConfig, camera: Camera) -> tuple[int, ...]:
     return (*config.iterations, *[config.iterations[-1]] * more)
 
 
-def _levels(frame: Frame, rendering: Rendering, weight: Plane, config: AlignmentConfig) -> list[_Level]:
-    """The levels that have passes, finest first."""
-    intensity, depth = kernels.rendered_view(
-        rendering.color.numpy(), rendering.composited_plane_depth.numpy(), rendering.alpha.numpy(),
-        np.float32(config.min_alpha),
-    )  # fmt: skip
+def _levels(frame: Frame, rendering: Rendering, weight: Plane, config: AlignmentConfig) -> tuple[list[_Level], Floats]:
+    """The levels that have passes, finest first; and points that tell the exposure, for the first of them.
+
+    The solver compares with colours that are divided by alpha. Through thin places the background of the map's frame
+    shows, which optimisation closes in time: dividing makes them too bright, not dividing leaves them too dark. So
+    exposure is told by colours that are not divided, where the map is all but opaque.
+    """
+    images = rendering.color.numpy(), rendering.composited_plane_depth.numpy(), rendering.alpha.numpy()
+    intensity, depth = kernels.rendered_view(*images, np.float32(config.min_alpha))
+    composited, solid = luma(rendering.color), kernels.rendered_view(*images, np.float32(_SOLID))[1]
+    solid_points: Floats = np.empty((0, 0), np.float32)
     weights = np.ascontiguousarray(weight.numpy())
     live, live_depth = kernels.live_view(frame.color.numpy(), frame.depth.numpy(), frame.valid.numpy())
-    camera, levels = frame.camera, []
+    camera, levels = frame.camera, list[_Level]()
     for number, passes in enumerate(_passes(config, camera)):
         if number:
             intensity, weights, live = (kernels.halved_intensity(image) for image in (intensity, weights, live))
             depth, live_depth = kernels.halved_depth(depth), kernels.halved_depth(live_depth)
+            if not levels:
+                composited, solid = kernels.halved_intensity(composited), kernels.halved_depth(solid)
             camera = camera.scaled(0.5)
         if passes:
             intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
             sampling = (2, config.stride) if camera.width > _SPARSE else (1, 1)
             gate = 2 * config.gate if number else config.gate
             points = kernels.reference_points(intensity, depth, weights, intrinsics, *sampling)
-            levels.append(_Level(passes, points, kernels.live_image(live, live_depth), intrinsics, sampling, gate))
-    return levels
+            if not levels:
+                solid_points = kernels.reference_points(composited, solid, weights, intrinsics, *sampling)
+            levels.append(_Level(passes, points, kernels.live_image(live, live_depth), intrinsics, gate))
+    return levels, solid_points
 
 
 @dataclass
@@ -209,22 +216,10 @@ def _constants(level: _Level, T: Doubles, photometry: _Photometry, config: Align
     return constants
 
 
-def _exposure(
-    rendering: Rendering, weight: Plane, level: _Level, T: Doubles, photometry: _Photometry, config: AlignmentConfig
-) -> Exposure:
-    """Of the frame over the rendered view, at the pose that was found, where the map is all but opaque.
-
-    The solver compares with colours that are divided by alpha. Through thin places the background of the map's frame
-    shows, which optimisation closes in time: dividing makes them too bright, not dividing leaves them too dark.
-    """
-    color = rendering.color.numpy()
-    _, depth = kernels.rendered_view(
-        color, rendering.composited_plane_depth.numpy(), rendering.alpha.numpy(), np.float32(_SOLID)
-    )
-    weights = np.ascontiguousarray(weight.numpy())
-    points = kernels.reference_points(kernels.luma(color), depth, weights, level.intrinsics, *level.sampling)
+def _exposure(level: _Level, T: Doubles, photometry: _Photometry, config: AlignmentConfig) -> Exposure:
+    """What a level's points tell at the pose that was found."""
     found = replace(photometry)
-    found.refit(kernels.normal_equations(points, level.live, _constants(level, T, photometry, config)))
+    found.refit(kernels.normal_equations(level.points, level.live, _constants(level, T, photometry, config)))
     return Exposure(found.gain, found.offset)
 
 
@@ -273,7 +268,7 @@ def align(frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, co
         T_map_ref: Pose of the rendered view, and the guess to start from.
         config: Constants.
     """
-    levels = _levels(frame, rendering, weight, config)
+    levels, solid_points = _levels(frame, rendering, weight, config)
     finest = levels[0]
     T = np.eye(4)  # reference camera to live camera
     photometry, sums, passes = _Photometry(), np.zeros(kernels.SUMS), 0
@@ -298,7 +293,7 @@ def align(frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, co
             *(float(sums[k]) for k in (kernels.GAIN_W, kernels.GAIN_R, kernels.GAIN_L)),
             *(float(sums[k]) for k in (kernels.GAIN_RR, kernels.GAIN_RL, kernels.GAIN_LL)),
         ),
-        exposure=_exposure(rendering, weight, finest, T, photometry, config),
+        exposure=_exposure(replace(finest, points=solid_points), T, photometry, config),
         color=color,
         depth=depth,
     )

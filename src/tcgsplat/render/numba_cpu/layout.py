@@ -65,9 +65,9 @@ def to_blocks(blocks: Floats, table: npt.NDArray[np.float32]) -> None:
 
 
 def from_blocks(blocks: Floats) -> Floats:
-    """The table [16 m, k] of blocks [m, k, 16]."""
+    """The table [16 m, k] of blocks [m, k, 16], a copy."""
     m, k, _ = blocks.shape
-    return blocks.transpose(0, 2, 1).reshape(16 * m, k)
+    return blocks.transpose(0, 2, 1).copy().reshape(16 * m, k)
 
 
 # Lane k of a block of pixels is pixel (k % 4, k // 4); block b of a tile begins at pixel (4 (b % 4), 4 (b // 4)).

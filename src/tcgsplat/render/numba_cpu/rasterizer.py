@@ -1,7 +1,7 @@
 """The CPU rasterizer: torch values in and out, the kernels' two passes between."""
 
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -55,7 +55,7 @@ class NumbaRasterizer:
         """A rasterizer on so many threads of the CPU, by default as many as this process may run on."""
         self.device = torch.device("cpu")
         self.passes = Passes(threads)
-        self._packed: WeakKeyDictionary[Splats, Floats] = WeakKeyDictionary()
+        self._parameters: WeakKeyDictionary[Splats, tuple[list[int], Floats]] = WeakKeyDictionary()
 
     def __call__(self, splats: Splats, camera: Camera, T_cam_map: Pose) -> Raster:
         """Draw; see `Rasterizer`. The same splats, drawn again without gradients, are not packed again."""
@@ -74,6 +74,16 @@ class NumbaRasterizer:
             visible=visible,
         )
 
+    def _packed(self, splats: Splats, features: Tensor) -> Floats:
+        """The splats' parameters with some of their features; kept while the splats live and are not written to."""
+        if features is not splats.features:
+            return _packed(replace(splats, features=features))
+        versions = [getattr(splats, field.name)._version for field in fields(splats)]
+        kept = self._parameters.get(splats)
+        if kept is None or kept[0] != versions:
+            kept = self._parameters[splats] = versions, _packed(splats)
+        return kept[1]
+
     def reserved(self) -> AbstractContextManager[None]:
         """See `Rasterizer`."""
         return self.passes.workers.reserved()
@@ -83,12 +93,7 @@ class NumbaRasterizer:
     ) -> tuple[Float[Tensor, "channels h w"], PerGaussianFlag]:
         tensors = (splats.means, splats.quats, splats.scales, splats.opacities, features, T_cam_map)
         if not (torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)):
-            parameters = self._packed.get(splats) if features is splats.features else None
-            if parameters is None:
-                parameters = _packed(replace(splats, features=features))
-                if features is splats.features:
-                    self._packed[splats] = parameters
-            drawn = self.passes.draw(parameters, camera, T_cam_map.to(torch.float64).numpy())
+            drawn = self.passes.draw(self._packed(splats, features), camera, T_cam_map.to(torch.float64).numpy())
             return torch.from_numpy(drawn.planes), torch.from_numpy(drawn.visible[: len(splats.means)])
         result: tuple[Tensor, Tensor] = _Draw.apply(  # type: ignore[no-untyped-call]
             self, camera, *tensors
