@@ -103,18 +103,18 @@ def self_distances(raw, before, n, constants, out):
 
 
 @kept(njit(**INNER))
-def _adam_step(start, stop, raw, P, before, first, second, clocks, grads, visible, allowed, scale, constants, excess):
+def _adam_step(start, stop, raw, P, before, first, second, clocks, grads, depths, allowed, scale, constants, excess):
     """One Adam step of the visible Gaussians of a range, on the losses of the pixels and of Eq. 23.
 
-    `grads` holds the derivatives by `P`; they are led on to the raw parameters. `clocks` are two rows a block: what is left of
-    beta^t of either moment, for each Gaussian's own count t of steps. `allowed` is the self-distance up to which
-    Eq. 23 costs nothing (infinite where it does not apply), `scale` the factor of Eq. 24 on the geometry's steps;
-    `excess` receives what Eq. 23 sums for each Gaussian, in metres.
+    Visible are those whose depth is not 0. `grads` holds the derivatives by `P`; they are led on to the raw parameters.
+    `clocks` are two rows a block: what is left of beta^t of either moment, for each Gaussian's own count t of steps.
+    `allowed` is the self-distance up to which Eq. 23 costs nothing (infinite where it does not apply), `scale` the
+    factor of Eq. 24 on the geometry's steps; `excess` receives what Eq. 23 sums for each Gaussian, in metres.
     Eq. 6 is differentiated without its epsilon, which only matters to splats of a nanometre.
     """
     zero, one = spread(_ZERO), spread(_ONE)
     for i in range(start, stop, 16):
-        seen = load(visible, i)
+        seen = where_ge(load(depths, i), spread(_TINY), one, zero)
         if mask_ge(seen, one) == 0:
             store(excess, i, zero)
             continue
@@ -162,14 +162,14 @@ def _adam_step(start, stop, raw, P, before, first, second, clocks, grads, visibl
 
 @kept(njit(**KERNEL))
 def adam_step(
-    progress, n, raw, P, before, first, second, clocks, grads, visible, allowed, scale, constants, excess
+    progress, n, raw, P, before, first, second, clocks, grads, depths, allowed, scale, constants, excess
 ):
     """`_adam_step` for all Gaussians, shared by threads in units. False: has waited for long."""
     units = -(-n // UNIT)
     k = next_unit(progress, 0, units, 0)
     while k >= 0:
         _adam_step(
-            k * UNIT, min((k + 1) * UNIT, n), raw, P, before, first, second, clocks, grads, visible, allowed, scale,
+            k * UNIT, min((k + 1) * UNIT, n), raw, P, before, first, second, clocks, grads, depths, allowed, scale,
             constants, excess,
         )
         k = next_unit(progress, 0, units, 1)

@@ -25,7 +25,7 @@ from tcgsplat.render.numba_cpu.layout import (
     from_blocks,
     to_blocks,
 )
-from tcgsplat.render.numba_cpu.passes import Passes, Workspace
+from tcgsplat.render.numba_cpu.passes import Drawn, Passes, Workspace
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag
@@ -78,7 +78,6 @@ class NativeOptimization:
         self._allowed = self._row(np.inf, self._allowed_distance())
         self._scale = self._row(1.0, self._step_scale())
         self._excess = filled(0.0, self._padded)
-        self._visible = filled(0.0, self._padded)
         self._rates = _rates(config)
         self._window = ssim_window().numpy()
         self._space = Workspace()
@@ -91,11 +90,10 @@ class NativeOptimization:
         d_planes = self._differentiated_losses(target, drawn.planes)
         grads = self._space.floats("grads", *self._parameters.shape)
         self._passes.differentiate(drawn, d_planes, grads)
-        self._visible[:] = drawn.visible
-        self._stability_weight = self._confidence.stability_weight / self._count()
+        self._stability_weight = self._confidence.stability_weight / self._count(drawn)
         arrays = (
             self._padded, _flat(self._raw), _flat(self._parameters), _flat(self._before), _flat(self._first),
-            _flat(self._second), _flat(self._clocks), _flat(grads), self._visible, self._allowed, self._scale,
+            _flat(self._second), _flat(self._clocks), _flat(grads), drawn.depths, self._allowed, self._scale,
             self._constants(pace), self._excess,
         )  # fmt: skip
         self._share(kernels.adam_step, 1, lambda _: arrays)
@@ -202,10 +200,10 @@ class NativeOptimization:
             p_min=config.p_min,
         )
 
-    def _count(self) -> float:
+    def _count(self, drawn: Drawn) -> float:
         """What Eq. 23 divides by."""
         mean = self._confidence.stability_reduction == "mean"
-        return max(float(self._visible @ self._counted), 1.0) if mean else 1.0
+        return max(float(self._counted[drawn.visible].sum(dtype=np.float64)), 1.0) if mean else 1.0
 
     def _constants(self, pace: float) -> Floats:
         config = self._confidence

@@ -35,7 +35,7 @@ class Iteration:
         self._clocks = filled(1.0, self._padded // 16, 2, 16)
         self._allowed, self._scale = filled(np.inf, self._padded), filled(1.0, self._padded)
         self._constants: Floats = np.zeros(kernels.CONSTANTS, np.float32)
-        self._excess, self._visible = filled(0.0, self._padded), filled(0.0, self._padded)
+        self._excess = filled(0.0, self._padded)
         generator = np.random.default_rng(1)
         self._d_planes = generator.random((CHANNELS, camera.height, camera.width), np.float32)
 
@@ -44,11 +44,10 @@ class Iteration:
         drawn = self.draw()
         grads = self._space.floats("grads", *self.parameters.shape)
         self._passes.differentiate(drawn, self._d_planes, grads)
-        self._visible[:] = drawn.visible
         arrays = (
             self._padded, self.raw.reshape(-1), self.parameters.reshape(-1), self._before.reshape(-1),
             self.first.reshape(-1), self.second.reshape(-1), self._clocks.reshape(-1), grads.reshape(-1),
-            self._visible, self._allowed, self._scale, self._constants, self._excess,
+            drawn.depths, self._allowed, self._scale, self._constants, self._excess,
         )  # fmt: skip
         self._passes.workers.share(partial(kernels.adam_step, self._space.progress(1)), lambda _: arrays)
 
