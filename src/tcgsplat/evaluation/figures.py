@@ -155,7 +155,7 @@ def trajectory_plot(
     aside = int(spread.argmin())
     across, up = (axis for axis in range(3) if axis != aside)
 
-    left, between, right, top, bottom, strip = 80, 84, 104, 56, 62, 130
+    left, between, right, top, bottom, strip = 80, 84, 120, 56, 62, 130
     room = width - left - between - right
     scale = min(float(room / (span[across] + span[aside])), _TALLEST / float(span[up]))  # pixels a metre
     height = round(scale * float(span[up]))
