@@ -115,3 +115,14 @@ def test_guesses_have_the_brightness_of_the_map(rasterizer: Rasterizer) -> None:
         for k in (plain, dark)
     ]
     torch.testing.assert_close(maps[0].gaussians.sh, maps[1].gaussians.sh, atol=1e-5, rtol=0)
+
+
+def test_far_from_any_reading_nothing_is_guessed(rasterizer: Rasterizer) -> None:
+    keyframe = looking(1.0)
+    depth = torch.zeros_like(keyframe.frame.depth)
+    depth[:, :2] = 1.0
+    only_left = replace(keyframe, frame=replace(keyframe.frame, depth=depth))
+    submap = replace(Submap.anchored(se3.identity(), index=0), keyframes=(only_left,))
+    whole = completed(submap, SEEDING, CONFIDENCE, rasterizer)
+    u = CAMERA.project(whole.gaussians.means)[:, 0]
+    assert u.min() == pytest.approx(2, abs=0.1) and u.max() == pytest.approx(1 + CAMERA.width // 4, abs=1.1)

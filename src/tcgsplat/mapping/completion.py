@@ -23,6 +23,9 @@ from tcgsplat.tensors import PerGaussianFlag, Plane
 _NEIGHBOURHOOD = 1 / 36
 """Of the image's width: how far about the nearest reading the farthest one is looked for. What hides from the sensor
 lies behind the edge that hides it, and there the readings of both sides are some pixels apart."""
+_REACH = 1 / 4
+"""Of the image's width: farther from any reading nothing is guessed. A picture with a handful of readings would become
+a curtain at their depth."""
 _BEHIND = 1.02
 """Times the farthest reading nearby: a guess had better lie behind what was measured than in front of it."""
 
@@ -30,9 +33,10 @@ _BEHIND = 1.02
 def completed(submap: Submap, config: SeedingConfig, confidence: ConfidenceConfig, rasterizer: Rasterizer) -> Submap:
     """A finished submap with guessed Gaussians where its keyframes show something that is neither mapped nor measured.
 
-    A guess lies a little behind the farthest reading nearby, in the picture's colour, with the lowest confidence there
-    is. One that any keyframe has measured free space at is not made. All others stay as they are, and so does the
-    order. Guesses have negative ids, unique in a run: nothing else tells them from what was measured.
+    A guess lies a little behind the farthest reading nearby, if there is any within a quarter of the image's width. It
+    has the picture's colour and the lowest confidence there is. One that any keyframe has measured free space at is not
+    made. All others stay as they are, and so does the order. Guesses have negative ids, unique in a run: nothing else
+    tells them from what was measured.
 
     Args:
         submap: Sealed, with its keyframes.
@@ -50,6 +54,7 @@ def completed(submap: Submap, config: SeedingConfig, confidence: ConfidenceConfi
         if not bool(open_.any()):
             continue
         guessed = replace(frame, depth=_guessed_depth(frame))
+        open_ = open_ & (guessed.depth > 0)
         seeds = surface_seeds(guessed, keyframe.T_map_cam, open_, submap.gaussians.sh_degree, ids, config)
         for other in submap.keyframes:
             seeds = seeds.kept(~_refuted(seeds.means, other, config.behind))
@@ -63,17 +68,20 @@ def completed(submap: Submap, config: SeedingConfig, confidence: ConfidenceConfi
 
 
 def _guessed_depth(frame: Frame) -> Plane:
-    """The frame's depth, and where there is none, a little more than the farthest reading about the nearest one."""
+    """The frame's depth, and where there is none, a little more than the farthest reading about the nearest one; 0
+    where that is too far away.
+    """
     depth = frame.depth.numpy()
     missing = depth <= 0
-    _, labels = cv2.distanceTransformWithLabels(
+    distance, labels = cv2.distanceTransformWithLabels(
         missing.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
     of_label = np.zeros(labels.max() + 1, np.float32)
     of_label[labels[~missing]] = depth[~missing]
     reach = max(round(_NEIGHBOURHOOD * frame.camera.width), 1) // 2 * 2 + 1
     farthest = cv2.dilate(of_label[labels], np.ones((reach, reach), np.uint8))
-    return torch.from_numpy(np.where(missing, np.float32(_BEHIND) * farthest, depth))
+    guess = np.where(distance <= _REACH * frame.camera.width, np.float32(_BEHIND) * farthest, np.float32(0))
+    return torch.from_numpy(np.where(missing, guess, depth))
 
 
 def _refuted(means: torch.Tensor, keyframe: Keyframe, behind: float) -> PerGaussianFlag:
