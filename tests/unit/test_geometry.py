@@ -128,6 +128,13 @@ def test_orthonormalized_repairs_drift_and_never_mirrors() -> None:
 # The camera
 
 
+def test_an_image_spans_half_a_pixel_around_its_outermost_centres() -> None:
+    width, height = CAMERA.width, CAMERA.height
+    inside = torch.tensor([[0, 0], [-0.49, 3], [width - 0.51, height - 0.51]])
+    outside = torch.tensor([[-0.51, 3], [3, -0.51], [width - 0.49, 3], [3, height - 0.49], [math.nan, 3]])
+    assert CAMERA.contains(inside).all() and not CAMERA.contains(outside).any()
+
+
 def test_a_point_on_the_axis_projects_to_the_principal_point() -> None:
     torch.testing.assert_close(CAMERA.project(row(0, 0, 2)), row(319.5, 239.5))
     torch.testing.assert_close(CAMERA.project(row(0.2, -0.1, 2)), row(319.5 + 50, 239.5 - 25.5))

@@ -8,7 +8,7 @@ first centre at (0.5, 0.5) add the half pixel at their own door. Camera frame: x
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tcgsplat.tensors import Plane
@@ -46,6 +46,11 @@ class Camera:
         """Pixel coordinates (u, v) of points in the camera frame; the caller sees to it that z > 0."""
         x, y, z = points.unbind(-1)
         return torch.stack((self.fx * x / z + self.cx, self.fy * y / z + self.cy), dim=-1)
+
+    def contains(self, pixels: Float[Tensor, "*batch 2"]) -> Bool[Tensor, " *batch"]:
+        """Whether pixel coordinates (u, v) are in the image, which spans [-0.5, width - 0.5] x [-0.5, height - 0.5]."""
+        u, v = pixels.unbind(-1)
+        return (u > -0.5) & (u < self.width - 0.5) & (v > -0.5) & (v < self.height - 0.5)
 
     def rays(self, device: torch.device | None = None) -> Float[Tensor, "h w 3"]:
         """The ray through each pixel's centre, scaled to z = 1."""

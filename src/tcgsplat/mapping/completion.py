@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 import torch
 
-from tcgsplat.confidence.state import ConfidenceConfig, ConfidenceState
+from tcgsplat.confidence import equations as eq
+from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.seeding import IdSource, SeedingConfig, surface_seeds
 from tcgsplat.render.protocol import Rasterizer
@@ -45,6 +46,7 @@ def completed(submap: Submap, config: SeedingConfig, confidence: ConfidenceConfi
         rasterizer: Backend.
     """
     ids, view = IdSource(first=-(submap.index + 1) << 32), SubmapView(submap, rasterizer)
+    lowest = replace(confidence, initial=confidence.p_min)
     for keyframe in submap.keyframes:
         frame = keyframe.balanced
         if not frame.has_depth:
@@ -58,11 +60,7 @@ def completed(submap: Submap, config: SeedingConfig, confidence: ConfidenceConfi
         seeds = surface_seeds(guessed, keyframe.T_map_cam, open_, submap.gaussians.sh_degree, ids, config)
         for other in submap.keyframes:
             seeds = seeds.kept(~_refuted(seeds.means, other, config.behind))
-        state = ConfidenceState.born_at(submap.clock, len(seeds), confidence)
-        state = replace(state, value=torch.full_like(state.value, confidence.p_min))
-        submap = replace(
-            submap, gaussians=submap.gaussians.appended(seeds), confidence=submap.confidence.appended(state)
-        )
+        submap = submap.grown(seeds, lowest)
         view = SubmapView(submap, rasterizer)
     return submap
 
@@ -89,8 +87,5 @@ def _refuted(means: torch.Tensor, keyframe: Keyframe, behind: float) -> PerGauss
     camera, depth = keyframe.frame.camera, keyframe.frame.depth
     points = se3.transform(se3.inverse(keyframe.T_map_cam), means)
     z = points[:, 2]
-    pixels = camera.project(torch.cat((points[:, :2], z.clamp_min(1e-3)[:, None]), dim=1)).round().long()
-    limit = torch.tensor([camera.width, camera.height])
-    inside = (z > 0) & (pixels >= 0).all(dim=1) & (pixels < limit).all(dim=1)
-    u, v = pixels.clamp_min(0).minimum(limit - 1).unbind(dim=1)
-    return inside & (depth[v, u] - z > behind)
+    pixels = camera.project(torch.cat((points[:, :2], z.clamp_min(1e-3)[:, None]), dim=1))
+    return (z > 0) & camera.contains(pixels) & (eq.sample_at(depth, pixels) - z > behind)

@@ -20,8 +20,6 @@ def observation(mapped: Mapped, frame: Frame, config: ConfidenceConfig, depth_mo
     submap, rendering = mapped.submap, mapped.rendering
     points = se3.transform(se3.inverse(submap.keyframes[-1].T_map_cam), submap.gaussians.means)
     pixels = frame.camera.project(torch.cat((points[:, :2], points[:, 2:].clamp_min(1e-6)), dim=1))
-    limit = torch.tensor([frame.camera.width - 0.5, frame.camera.height - 0.5], device=pixels.device)
-    inside = ((pixels > -0.5) & (pixels < limit)).all(dim=1)
 
     residual = eq.residual_map(
         color_error(rendering.color, frame.color),
@@ -30,9 +28,9 @@ def observation(mapped: Mapped, frame: Frame, config: ConfidenceConfig, depth_mo
         color_weight=config.color_residual_weight,
         depth_weight=config.depth_residual_weight,
     )
-    sees_the_world = eq.sample_at(frame.valid.float(), pixels) > 0.5
+    seen = rendering.visible & frame.camera.contains(pixels) & (eq.sample_at(frame.valid.float(), pixels) > 0.5)
     return Observation(
-        valid=rendering.visible & inside & sees_the_world & (submap.confidence.born < submap.clock),
+        valid=seen & (submap.confidence.born < submap.clock),
         distance=mapped.distance,
         residual=eq.sample_at(residual, pixels),
     )

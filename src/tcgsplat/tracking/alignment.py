@@ -143,9 +143,11 @@ def _levels(frame: Frame, rendering: Rendering, weight: Plane, config: Alignment
     shows, which optimisation closes in time: dividing makes them too bright, not dividing leaves them too dark. So
     exposure is told by colours that are not divided, where the map is all but opaque.
     """
-    images = rendering.color.numpy(), rendering.composited_plane_depth.numpy(), rendering.alpha.numpy()
-    intensity, depth = kernels.rendered_view(*images, np.float32(config.min_alpha))
-    composited, solid = luma(rendering.color), kernels.rendered_view(*images, np.float32(_SOLID))[1]
+    alpha = rendering.alpha.numpy()
+    intensity, depth = kernels.rendered_view(
+        rendering.color.numpy(), rendering.composited_plane_depth.numpy(), alpha, np.float32(config.min_alpha)
+    )
+    composited, solid = luma(rendering.color), np.where(alpha > _SOLID, depth, np.float32(-1))
     solid_points: Floats = np.empty((0, 0), np.float32)
     weights = np.ascontiguousarray(weight.numpy())
     live, live_depth = kernels.live_view(frame.color.numpy(), frame.depth.numpy(), frame.valid.numpy())
