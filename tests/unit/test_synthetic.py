@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tcgsplat.datasets.opening import open_sequence
-from tcgsplat.datasets.synthetic import SynthConfig, synthesize
+from tcgsplat.datasets.synthetic import SynthConfig, synthesize, twins
 from tcgsplat.datasets.synthetic.lighting import Workspace
 from tcgsplat.datasets.synthetic.materials import palette
 from tcgsplat.datasets.synthetic.patterns import noise
@@ -43,6 +43,11 @@ def studio(workers: Executor) -> Studio:
 @pytest.fixture(scope="module")
 def peopled(workers: Executor) -> Studio:
     return furnished_studio(SMALL.width, SMALL.height, 0, moving_object=True, workers=workers)
+
+
+@pytest.fixture(scope="module")
+def twin_rooms(workers: Executor) -> Studio:
+    return furnished_studio(SMALL.width, SMALL.height, 0, moving_object=False, workers=workers, place="twins")
 
 
 @pytest.fixture(scope="module")
@@ -332,7 +337,7 @@ def test_a_sequence_is_there_when_it_is_complete(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "name"),
     [({"frames": 1}, "frames"), ({"width": 8}, "width"), ({"fps": 0.0}, "fps"), ({"seed": -1}, "seed"),
-     ({"layout": "kitti"}, "layout"), ({"fps": float("nan")}, "fps")],
+     ({"layout": "kitti"}, "layout"), ({"place": "attic"}, "place"), ({"fps": float("nan")}, "fps")],
 )  # fmt: skip
 def test_settings_that_cannot_be_are_named(change: dict[str, object], name: str) -> None:
     with pytest.raises(ConfigError, match=name):
@@ -431,6 +436,79 @@ def test_long_walks_lose_runs_of_frames() -> None:
     edges = np.flatnonzero(np.diff(lost.astype(int)))
     assert 4 <= len(edges) // 2 <= 6
     assert 0.01 < lost.mean() < 0.07
+
+
+# Two rooms that look the same.
+
+
+def test_the_apartment_is_what_it_was_before_there_were_twins(base: Path) -> None:
+    """A texture that starts elsewhere changes these pixels already."""
+    vertices, triangles = read_mesh(base / "mesh.ply")
+    assert (len(vertices), len(triangles)) == (60513, 72604)
+    color, depth = images(base, "rgb"), images(base, "depth")
+    np.testing.assert_allclose(color.mean(axis=(1, 2, 3))[::4], [136.627, 134.522, 128.689], atol=0.05)
+    np.testing.assert_allclose(depth.mean(axis=(1, 2))[::4], [14171.05, 17504.28, 10023.94], atol=0.5)
+    before = [
+        [[205, 215, 211], [116, 149, 156], [168, 195, 197], [87, 102, 123]],
+        [[107, 128, 134], [86, 115, 126], [73, 115, 198], [118, 123, 82]],
+        [[115, 157, 215], [57, 78, 65], [62, 72, 77], [67, 83, 138]],
+    ]
+    np.testing.assert_allclose(color[0, 8:48:16, 8:64:16], before, atol=1.0)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_walk_sees_room_two_as_it_saw_room_one_and_comes_back(seed: int) -> None:
+    T = camera_poses(SynthConfig(place="twins", seed=seed), np.arange(600) / 30)
+    moved, turned = motion(T)
+    assert moved.max() < 0.042
+    assert turned.max() < 3.1
+    (away,), (askew,) = motion(T[[0, -1]])
+    assert away < 0.05
+    assert askew < 3
+    in_the_hall = T[:, 0, 3] > twins.HALL[0]
+    assert np.flatnonzero(np.diff(in_the_hall.astype(int))).size == 4, "into the hall and out of it, twice"
+    for view in T[:100:10]:
+        analogous = view.copy()
+        analogous[:3, 3] += twins.APART
+        metres, degrees = np.transpose([motion(np.stack((analogous, pose))) for pose in T])[0]
+        assert (metres + np.radians(degrees)).min() < 0.1
+
+
+def test_from_inside_the_twins_look_the_same(twin_rooms: Studio) -> None:
+    differing = []
+    for T in camera_poses(SynthConfig(place="twins"), np.array([0, 18, 36, 54, 72, 90, 108]) / 30):
+        one = twin_rooms.shot(T[None], STILL)
+        elsewhere = T.copy()
+        elsewhere[:3, 3] += twins.APART
+        two = twin_rooms.shot(elsewhere[None], STILL)
+        np.testing.assert_allclose(two.depth, one.depth, atol=1e-4)
+        difference = 255 * np.abs(two.color - one.color).max(axis=2)
+        assert np.median(difference) < 5, "the light of a few rays differs a little"
+        differing.append(float((difference > 40).mean()))
+        elsewhere[:3, 3] += (0.3, 0.0, 0.0)
+        beside = twin_rooms.shot(elsewhere[None], STILL)
+        moved = 255 * np.abs(beside.color - one.color).max(axis=2)
+        assert moved.mean() > 3 * difference.mean(), "this would not notice another room"
+    assert 0.01 < max(differing) < 0.06, "a poster"
+    assert np.median(differing) < 0.01
+
+
+def test_the_twins_are_recorded_like_the_apartment(twin_rooms: Studio, workers: Executor, tmp_path: Path) -> None:
+    config = replace(SMALL, place="twins")
+    record(twin_rooms, tmp_path, config, workers)
+    truth = open_sequence(tmp_path).ground_truth()
+    np.testing.assert_allclose(truth[7].numpy(), camera_poses(config, np.array([7 / 30]))[0], atol=1e-12)
+    vertices, triangles = read_mesh(tmp_path / "mesh.ply")
+    corners = vertices[triangles]
+    two_sided = twin_rooms.scene.mesh.two_sided[twin_rooms.scene.mesh.patch]
+    facing_both_ways = np.concatenate((corners, corners[two_sided][:, ::-1]))
+    depth, view = images(tmp_path, "depth") / 5000.0, twin_rooms.view
+    assert (depth > 0).all(), "a ray has slipped between two surfaces"
+    for index, row, column in ((0, 20, 30), (3, 10, 50), (5, 40, 12), (7, 24, 32), (9, 30, 60)):
+        T = truth[index].numpy()
+        ray = np.array([(column - view.cx) / view.focal, (row - view.cy) / view.focal, 1.0])
+        expected = nearest_hit(facing_both_ways, T[:3, 3], T[:3, :3] @ ray, one_sided=True)
+        assert depth[index, row, column] == pytest.approx(expected, abs=2e-4)
 
 
 # Paint.

@@ -4,6 +4,7 @@ The living room spans x 0 to 5, the kitchen x 5.12 to 9.2, both y 0 to 4.4; a wi
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from tcgsplat.datasets.synthetic import furniture as f
 from tcgsplat.datasets.synthetic import ornaments as o
 from tcgsplat.datasets.synthetic.kitchen import kitchen_block
 from tcgsplat.datasets.synthetic.shapes import Patch, Vector, ball, box, cylinder, lathe, panel, placed, tube
+
+Array = np.ndarray[Any, np.dtype[Any]]
 
 HEIGHT = 2.6
 """Of both rooms, metres."""
@@ -22,12 +25,35 @@ DOORWAY = (1.65, 2.85, 2.12)
 """y from, y to and height of the passage between the rooms, metres."""
 PERSON_AT: Vector = (2.9, 1.8, 0.0)
 """A free place in the middle of the living room."""
+WALK = np.array(
+    [
+        # x, y, z in metres; yaw from the x axis towards y, pitch upwards, in degrees.
+        (3.62, 1.84, 1.45, 142, -13),
+        (3.16, 1.66, 1.48, 176, -14),
+        (2.66, 1.82, 1.50, 226, -14),
+        (2.82, 2.05, 1.47, 284, -11),
+        (3.42, 2.22, 1.46, 336, -11),
+        (4.25, 2.25, 1.48, 362, -10),
+        (5.06, 2.26, 1.49, 374, -10),
+        (5.78, 2.36, 1.48, 394, -12),
+        (6.24, 2.50, 1.46, 408, -13),
+        (6.36, 2.54, 1.48, 364, -13),
+        (6.28, 2.50, 1.49, 318, -15),
+        (6.12, 2.40, 1.49, 274, -13),
+        (5.84, 2.32, 1.48, 228, -12),
+        (5.40, 2.26, 1.46, 196, -10),
+        (4.72, 2.16, 1.47, 178, -12),
+        (4.06, 2.00, 1.47, 158, -13),
+        (3.63, 1.85, 1.45, 142, -13),
+    ]
+)
+"""Points on the camera's way through both rooms and back."""
 
-_Opening = tuple[float, float, float, float]
+Opening = tuple[float, float, float, float]
 """A hole in a wall: from, to along the wall from its left end, from, to in height, metres."""
 
 
-def _wall(start: tuple[float, float], end: tuple[float, float], material: str, holes: list[_Opening]) -> list[Patch]:
+def _wall(start: tuple[float, float], end: tuple[float, float], material: str, holes: list[Opening]) -> list[Patch]:
     """A wall from its left to its right end as seen from inside, with holes and skirting; its pattern runs through."""
     a, b = np.asarray(start), np.asarray(end)
     length = float(np.linalg.norm(b - a))
@@ -58,8 +84,8 @@ def _wall(start: tuple[float, float], end: tuple[float, float], material: str, h
     return pieces
 
 
-def _shell(
-    room: tuple[float, float, float, float], wall: str, other: str, floor: str, holes: dict[str, list[_Opening]]
+def shell(
+    room: tuple[float, float, float, float], wall: str, other: str, floor: str, holes: dict[str, list[Opening]]
 ) -> list[Patch]:
     """Floor, ceiling and four walls; the north and south walls may be of another material than the rest."""
     x0, x1, y0, y1 = room
@@ -93,10 +119,9 @@ def _window(width: float, height: float, view: str) -> list[Patch]:
     return parts + box((width + 0.2, 0.16, 0.03), "trim", at=(0, -0.04, -0.03))
 
 
-def _doorway() -> list[Patch]:
-    """Jambs and casings of the passage."""
+def doorway(x0: float, x1: float) -> list[Patch]:
+    """Jambs and casings of the passage through a wall from `x0` to `x1`."""
     y0, y1, top = DOORWAY
-    x0, x1 = LIVING[1], KITCHEN[0]
     deep = x1 - x0
     parts = [
         panel((x1, y0, top), (-deep, 0, 0), (0, 0, -top), "trim", turned=True),
@@ -111,7 +136,7 @@ def _doorway() -> list[Patch]:
     return parts
 
 
-def _closed_door() -> list[Patch]:
+def closed_door() -> list[Patch]:
     """A panelled door with its casing and handle, in front of a wall at y = 0 seen from -y."""
     parts = box((0.86, 0.03, 2.02), "oak", at=(0, -0.015, 0))
     for x in (-0.2, 0.2):
@@ -124,7 +149,17 @@ def _closed_door() -> list[Patch]:
     return parts
 
 
-def _living_room(rng: np.random.Generator) -> list[Patch]:
+def living_shell() -> list[Patch]:
+    """The living room without anything in it, but with holes for its window and the doorway."""
+    y0, y1, top = DOORWAY
+    holes: dict[str, list[Opening]] = {
+        "east": [(LIVING[3] - y1, LIVING[3] - y0, 0.0, top)],
+        "west": [(1.55, 3.05, 0.95, 2.20)],
+    }
+    return shell(LIVING, "wallpaper", "wallpaper", "floor_wood", holes)
+
+
+def living_room(rng: np.random.Generator) -> list[Patch]:
     """Sofa under pictures, round table on a rug, armchair, bookshelf, sideboard, plants, lamps."""
     parts = placed(_window(1.5, 1.25, "outdoors"), (0, 2.3, 0.95), yaw=90)
     for y, phase in ((1.27, 0.0), (3.33, 1.0)):
@@ -189,7 +224,7 @@ def _kitchen(rng: np.random.Generator) -> list[Patch]:
     for x, y, yaw in chairs:
         parts += placed(f.chair(), (table[0] + x, table[1] + y, 0.010), yaw=yaw + float(rng.uniform(-6, 6)))
     parts += _pendant(table)
-    parts += placed(_closed_door(), (5.85, 0.0, 0), yaw=180)
+    parts += placed(closed_door(), (5.85, 0.0, 0), yaw=180)
     parts += placed(o.picture(0.60, 0.60, "city_map", "black"), (7.10, 0.005, 1.6), yaw=180)
     parts += placed(o.picture(0.36, 0.54, "botanical", "oak"), (7.75, 0.005, 1.6), yaw=180)
     parts += placed(o.clock(), (6.54, 0.005, 2.05), yaw=180)
@@ -240,13 +275,12 @@ def furnished(seed: int) -> list[Patch]:
     """Both rooms with everything in them; the seed chooses books, fruits, plants and how chairs were left."""
     rng = np.random.default_rng((seed, 1))
     y0, y1, top = DOORWAY
-    doorway_west: _Opening = (y0, y1, 0.0, top)
-    doorway_east: _Opening = (LIVING[3] - y1, LIVING[3] - y0, 0.0, top)
-    parts = _shell(LIVING, "wallpaper", "wallpaper", "floor_wood",
-                   {"east": [doorway_east], "west": [(1.55, 3.05, 0.95, 2.20)]})  # fmt: skip
-    parts += _shell(KITCHEN, "wallpaper_kitchen", "brick", "floor_tile",
-                    {"west": [doorway_west], "east": [(KITCHEN[3] - 2.45, KITCHEN[3] - 1.05, 1.0, 2.10)]})  # fmt: skip
-    return parts + _doorway() + _living_room(rng) + _kitchen(rng)
+    holes: dict[str, list[Opening]] = {
+        "west": [(y0, y1, 0.0, top)],
+        "east": [(KITCHEN[3] - 2.45, KITCHEN[3] - 1.05, 1.0, 2.10)],
+    }
+    parts = living_shell() + shell(KITCHEN, "wallpaper_kitchen", "brick", "floor_tile", holes)
+    return parts + doorway(LIVING[1], KITCHEN[0]) + living_room(rng) + _kitchen(rng)
 
 
 def person() -> list[Patch]:

@@ -1,4 +1,4 @@
-"""The hand-held camera's way through the apartment and back, and the way of the person who walks about."""
+"""The hand-held camera's way past given points, and the way of the person who walks about."""
 
 from typing import Any
 
@@ -7,38 +7,17 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
-_WAYPOINTS = np.array(
-    [
-        # x, y, z in metres; yaw from the x axis towards y, pitch upwards, in degrees.
-        (3.62, 1.84, 1.45, 142, -13),
-        (3.16, 1.66, 1.48, 176, -14),
-        (2.66, 1.82, 1.50, 226, -14),
-        (2.82, 2.05, 1.47, 284, -11),
-        (3.42, 2.22, 1.46, 336, -11),
-        (4.25, 2.25, 1.48, 362, -10),
-        (5.06, 2.26, 1.49, 374, -10),
-        (5.78, 2.36, 1.48, 394, -12),
-        (6.24, 2.50, 1.46, 408, -13),
-        (6.36, 2.54, 1.48, 364, -13),
-        (6.28, 2.50, 1.49, 318, -15),
-        (6.12, 2.40, 1.49, 274, -13),
-        (5.84, 2.32, 1.48, 228, -12),
-        (5.40, 2.26, 1.46, 196, -10),
-        (4.72, 2.16, 1.47, 178, -12),
-        (4.06, 2.00, 1.47, 158, -13),
-        (3.63, 1.85, 1.45, 142, -13),
-    ]
-)
 _METRES_PER_DEGREE = 0.02 / 1.5
 """What makes turning and moving comparable: how fast one may do either before pictures get hard to follow."""
 _RAMP = 0.03
 """Part of the time in which the camera gets going, and in which it comes to rest."""
 
 
-def camera_poses(progress: Array, seconds: Array, seed: int) -> Array:
+def camera_poses(waypoints: Array, progress: Array, seconds: Array, seed: int) -> Array:
     """Poses of the camera along its way.
 
     Args:
+        waypoints: [k, 5] x, y, z (m) and yaw from the x axis towards y, pitch upwards (degrees) that it comes by.
         progress: [n] part of the way in time, 0 to 1; outside it the camera rests.
         seconds: [n] the same instants in seconds, which the shaking of the hand follows.
         seed: Of the shaking.
@@ -46,7 +25,7 @@ def camera_poses(progress: Array, seconds: Array, seed: int) -> Array:
     Returns:
         `T_world_cam` [n, 4, 4] float64.
     """
-    way = _way(progress)
+    way = _way(waypoints, progress)
     shake = _shake(seconds, seed)
     yaw, pitch, roll = np.radians(way[:, 3] + shake[:, 3]), np.radians(way[:, 4] + shake[:, 4]), np.radians(shake[:, 5])
     zero = np.zeros_like(yaw)
@@ -61,10 +40,10 @@ def camera_poses(progress: Array, seconds: Array, seed: int) -> Array:
     return T
 
 
-def _way(progress: Array) -> Array:
+def _way(waypoints: Array, progress: Array) -> Array:
     """Smooth positions (m) and yaw, pitch (degrees) [n, 5], at an even pace of moving and turning together."""
-    knots = np.concatenate(([0], np.cumsum(_effort(np.diff(_WAYPOINTS, axis=0)))))
-    spline = CubicSpline(knots, _WAYPOINTS)
+    knots = np.concatenate(([0], np.cumsum(_effort(np.diff(waypoints, axis=0)))))
+    spline = CubicSpline(knots, waypoints)
     fine = np.linspace(0, knots[-1], 4001)
     pace = _effort(spline(fine, 1))
     spent = np.concatenate(([0], np.cumsum(0.5 * (pace[1:] + pace[:-1]))))

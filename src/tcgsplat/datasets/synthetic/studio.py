@@ -1,4 +1,4 @@
-"""The apartment, lit, with a camera in it: pose in, exact picture out."""
+"""A furnished place, lit, with a camera in it: pose in, exact picture out."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from tcgsplat.datasets.synthetic import apartment, lighting, raster
+from tcgsplat.datasets.synthetic.places import PLACES, Name
 from tcgsplat.datasets.synthetic.raster import LightMap, View
 from tcgsplat.datasets.synthetic.scene import GAMMA, Scene, compiled
 
@@ -67,8 +68,10 @@ class Studio:
         return Shot(film, depth, incidence, np.where(seen, self.scene.shine[patch], 0), seen & (mesh.moves[patch] > 0))
 
 
-def furnished_studio(width: int, height: int, seed: int, *, moving_object: bool, workers: Executor) -> Studio:
-    """Build the apartment and its light: a few seconds.
+def furnished_studio(
+    width: int, height: int, seed: int, *, moving_object: bool, workers: Executor, place: Name = "apartment"
+) -> Studio:
+    """Build a place and its light: a few seconds.
 
     Args:
         width: Of the pictures, pixels.
@@ -76,8 +79,9 @@ def furnished_studio(width: int, height: int, seed: int, *, moving_object: bool,
         seed: Of colours, books and what lies about.
         moving_object: Whether there is somebody in it.
         workers: Threads to share the work.
+        place: What to build.
     """
-    scene = compiled(apartment.furnished(seed), apartment.person() if moving_object else [], seed, workers)
+    scene = compiled(PLACES[place].furnished(seed), apartment.person() if moving_object else [], seed, workers)
     # Light need not be finer than what a pixel sees from some three metres away.
     direct, indirect = lighting.lit(scene, float(np.clip(16 / width, 0.04, 0.25)), workers)
     focal = 0.5 * width / np.tan(np.radians(_FIELD_OF_VIEW / 2))

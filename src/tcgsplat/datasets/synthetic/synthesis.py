@@ -13,6 +13,7 @@ import numpy as np
 from tcgsplat.datasets.synthetic import path as way
 from tcgsplat.datasets.synthetic import sensor
 from tcgsplat.datasets.synthetic.apartment import PERSON_AT
+from tcgsplat.datasets.synthetic.places import PLACES, Name
 from tcgsplat.datasets.synthetic.studio import Shot, Studio, furnished_studio
 from tcgsplat.datasets.synthetic.writer import SequenceFiles, complete_or_absent, sequence_files, write_mesh
 from tcgsplat.errors import ConfigError
@@ -21,14 +22,14 @@ Array = np.ndarray[Any, np.dtype[Any]]
 
 _SHUTTER = 0.5
 """Part of the time from frame to frame in which the shutter is open, for motion blur."""
-_DEGREES = 900.0
-"""How far the view moves in the whole walk, about: turning, and moving past things two metres away."""
 
 
 @dataclass(frozen=True)
 class SynthConfig:
     """A walk through a furnished apartment of two rooms and back, as an RGB-D camera records it."""
 
+    place: Name = "apartment"
+    """Two different rooms with a doorway between them, or `twins`: two that look the same, and a hall between them."""
     frames: int = 600
     """Number of frames for the whole walk: with fewer, the camera moves faster."""
     width: int = 320
@@ -61,6 +62,8 @@ class SynthConfig:
             raise ConfigError(f"fps = {self.fps}: frames per second must be positive")
         if self.seed < 0:
             raise ConfigError(f"seed = {self.seed}: give a number from 0 on")
+        if self.place not in PLACES:
+            raise ConfigError(f"place = {self.place!r}: give 'apartment' or 'twins'")
         if self.layout not in ("tum", "replica"):
             raise ConfigError(f"layout = {self.layout!r}: give 'tum' or 'replica'")
 
@@ -81,7 +84,12 @@ def synthesize(out: Path, config: SynthConfig, progress: Callable[[int, int], No
     """
     with complete_or_absent(Path(out)) as folder, _threads() as workers:
         studio = furnished_studio(
-            config.width, config.height, config.seed, moving_object=config.moving_object, workers=workers
+            config.width,
+            config.height,
+            config.seed,
+            moving_object=config.moving_object,
+            workers=workers,
+            place=config.place,
         )
         record(studio, folder, config, workers, progress)
 
@@ -93,10 +101,10 @@ def record(
     workers: Executor,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Walk through a studio, made with the same size, seed and moving object, and write what the camera records.
+    """Walk through a studio, made with the same size, seed, place and moving object, and write what the camera records.
 
     Args:
-        studio: The apartment and its light.
+        studio: The place and its light.
         folder: Empty, and there already; the lists that make it readable are written last.
         config: What to record.
         workers: Threads to share the work.
@@ -128,7 +136,7 @@ def _threads() -> Iterator[Executor]:
 
 def camera_poses(config: SynthConfig, seconds: Array) -> Array:
     """The camera's exact poses `T_world_cam` [n, 4, 4] float64 at the given times [n] (seconds)."""
-    return way.camera_poses(_progress(config, seconds), seconds, config.seed)
+    return way.camera_poses(PLACES[config.place].walk, _progress(config, seconds), seconds, config.seed)
 
 
 def _progress(config: SynthConfig, seconds: Array) -> Array:
@@ -158,7 +166,7 @@ def _instants(config: SynthConfig, focal: float) -> Array:
     """When, in frames around the time stamp, the pictures that make up one are taken: one for each pixel of smear."""
     if not config.motion_blur:
         return np.zeros(1)
-    smear = _SHUTTER * focal * np.radians(_DEGREES / config.frames)
+    smear = _SHUTTER * focal * np.radians(PLACES[config.place].degrees / config.frames)
     half = int(np.clip(np.ceil(0.4 * smear), 2, 12))
     return np.arange(-half, half + 1) / (2 * half + 1) * _SHUTTER
 
