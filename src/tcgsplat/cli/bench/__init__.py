@@ -1,4 +1,4 @@
-"""`tcgsplat bench`: how long the stages take on this machine."""
+"""`tcgsplat bench`: how long the stages take on this machine, and what confidence is worth."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -55,12 +55,48 @@ class Track:
 
 
 @dataclass(frozen=True)
+class Ablation:
+    """Run the four rows of the paper's Table 6 on a sequence: confidence guides nothing (I), mapping (II), tracking too
+    (III), the choice of views for loop closure too (IV).
+
+    Each row is a real run for each seed, which draws keyframes and where Gaussians begin. The table has the error of
+    the path, its mean and spread over the seeds, and the published row. Finished runs are kept in OUT/ablation.json:
+    the same command, or one with more seeds, goes on from there. Every setting is a flag, as for `tcgsplat run`.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """The sequence; it must have ground truth."""
+    out: Path | None = None
+    """Folder for ablation.json and ablation.md; runs/ablation-NAME if left out, with the name of the sequence."""
+    seeds: int = 3
+    """Runs of each row."""
+    seed: int | None = None
+    """The first seed, the others follow it; that of the preset if left out."""
+    preset: str = "default"
+    """Where the settings start from: see `tcgsplat presets`."""
+    config: Path | None = None
+    """A TOML file of settings, such as the config.toml of a run."""
+    start: int = 0
+    """First frame, counted from 0."""
+    stride: int = 1
+    """Use every so many-th frame."""
+    limit: int | None = None
+    """Use no more than so many frames."""
+    backend: str = "auto"
+    """Rasterizer: auto, numba or reference."""
+
+
+@dataclass(frozen=True)
 class Args:
-    """Time the mapping's kernels on random scenes, or the whole system on a recorded sequence."""
+    """Time the mapping's kernels on random scenes, or the whole system on a recorded sequence; or see what it is worth
+    there that confidence guides it.
+    """
 
     what: tyro.conf.OmitSubcommandPrefixes[
         tyro.conf.OmitArgPrefixes[
-            Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Track, tyro.conf.subcommand("track")]
+            Annotated[Render, tyro.conf.subcommand("render")]
+            | Annotated[Track, tyro.conf.subcommand("track")]
+            | Annotated[Ablation, tyro.conf.subcommand("ablation")]
         ]
     ]
     settings: Flags = field(default_factory=dict)
@@ -68,11 +104,15 @@ class Args:
 
 
 def command(args: Args) -> int:
-    """Print tables, and write the file that was asked for."""
+    """Print tables, and write the files that were asked for."""
     if isinstance(args.what, Track):
         from tcgsplat.cli.bench import track
 
         return track.command(args.what, args.settings)
+    if isinstance(args.what, Ablation):
+        from tcgsplat.cli.bench import ablation
+
+        return ablation.command(args.what, args.settings)
     if args.settings:
         raise UsageError(f"bench render has no settings, but --{next(iter(args.settings))} was given; leave it out")
     from tcgsplat.cli.bench import render
