@@ -92,7 +92,10 @@ class RoomSequence:
         return len(self.T_world_cam)
 
     def __iter__(self) -> Iterator[Frame]:
-        return (self.frame(i) for i in range(len(self)))
+        return self.frames_from(0)
+
+    def frames_from(self, first: int) -> Iterator[Frame]:
+        return (self.frame(i) for i in range(first, len(self)))
 
     def frame(self, index: int) -> Frame:
         return self.room.frame(self.T_world_cam[index], index, self.camera)

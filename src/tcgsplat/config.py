@@ -18,6 +18,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.errors import ConfigError
+from tcgsplat.loop.settings import LoopConfig
 from tcgsplat.mapping.schedule import ScheduleConfig
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.tracking.tracker import TrackerConfig
@@ -36,6 +37,7 @@ class SlamConfig:
     confidence: ConfidenceConfig = field(default_factory=lambda: ConfidenceConfig().for_updates_of(40))
     """The defaults of `ConfidenceConfig` on the scale of the default mapper: its ten steps an update, with centres
     moving three times as fast, take a Gaussian at rest as far as forty of the base system's. [ours]"""
+    loop: LoopConfig = field(default_factory=LoopConfig)
     seed: int = 0
     """Of the one random generator. [base: TUM and ScanNet] (base: 1 on Replica)"""
 

@@ -158,6 +158,13 @@ _PUBLISHED: tuple[tuple[str, _Three, Origin, str], ...] = (
     ("confidence.guide_mapping", _same(True), "paper", "equations 20 to 24"),
     ("confidence.guide_tracking", _same(True), "paper", "equation 18"),
     ("confidence.rerank_views", _same(True), "paper", "equation 25"),
+    ("loop.enabled", _same(True), "paper", "Section 3.3"),
+    ("loop.descriptor", _same("vlad"), "ours", "the base system's NetVLAD needs weights: netvlad:PATH"),
+    ("loop.min_similarity", _same(0.5), "base", "min_similarity"),
+    ("loop.min_interval", (2, 3, 4), "base", "min_interval"),
+    ("loop.candidates", _same(1000), "base", "all that are similar enough"),
+    ("loop.preselected", _same(6), "paper", "Section 4.1"),
+    ("loop.views", _same(2), "paper", "Section 4.1"),
     ("seed", (1, 0, 0), "base", "seed"),
 )
 

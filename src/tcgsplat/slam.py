@@ -2,8 +2,9 @@
 
 A frame travels one way: synchronised, tracked, perhaps a new submap, perhaps grown into the map. The map is then
 optimised and judged on a thread of its own while the next frames are tracked, and comes into use a fixed number of
-frames later: what a run gives does not depend on how fast either thread was. Nothing flows back except through the
-submap. Files, progress and pictures are made by whoever consumes the reports.
+frames later: what a run gives does not depend on how fast either thread was. A finished submap is put away and compared
+with those before it on a third thread; what follows moves submaps as a whole. Nothing flows back except through the
+submap and where it stands. Progress and pictures are made by whoever consumes the reports.
 """
 
 import time
@@ -15,6 +16,9 @@ import torch
 
 from tcgsplat.config import SlamConfig
 from tcgsplat.geometry import se3
+from tcgsplat.loop.closer import Closure, LoopCloser, odometry
+from tcgsplat.loop.places import measured
+from tcgsplat.loop.relocalization import Relocalized
 from tcgsplat.mapping.completion import completed
 from tcgsplat.mapping.feedback import judged
 from tcgsplat.mapping.mapper import Grown, Mapper
@@ -26,6 +30,8 @@ from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory
+from tcgsplat.storage.checkpoint import Checkpoint
+from tcgsplat.storage.store import InMemory, SubmapStore
 from tcgsplat.tensors import Pose
 from tcgsplat.tracking.delay import DepthDelay
 from tcgsplat.tracking.motion import ConstantVelocity
@@ -57,19 +63,24 @@ class StepReport:
 
     frame_index: int
     tracked: Tracked
-    """Its pose is in the submap that was active when the frame came: in `sealed`, where that is given."""
+    """Its pose is in the submap that was active when the frame came: in `sealed`, where that is given. Of a frame that
+    was found again it is in the submap where it was found."""
     mapped: bool
     """Whether the frame began a mapping update."""
     update: MapUpdate | None
     """The mapping update, of an earlier frame as a rule, that came into use with this frame."""
     sealed: Submap | None
-    """The submap that this frame ended: to be written down, since SLAM forgets it now."""
+    """The submap that this frame ended."""
+    closure: Closure | None
+    """What comparing an earlier submap with those before it has shown, if it came into use with this frame."""
+    found: Relocalized | None
+    """Where the camera is after some lost frames, if the place was known again."""
     submap_index: int
     """Submap that the frame belongs to."""
     gaussians: int
     """In the active submap."""
     seconds: Mapping[str, float]
-    """Wall time by stage: waiting for the map, tracking, growing the map."""
+    """Wall time by stage: waiting for the map, tracking, looking up a lost frame, growing the map."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +99,9 @@ class Reference:
 class Slam:
     """The whole online system; `step` it through the frames, then `finish`."""
 
-    def __init__(self, config: SlamConfig, rasterizer: Rasterizer, *, live: bool = False) -> None:
+    def __init__(
+        self, config: SlamConfig, rasterizer: Rasterizer, *, live: bool = False, store: SubmapStore | None = None
+    ) -> None:
         """A system that has seen nothing yet.
 
         Args:
@@ -96,66 +109,97 @@ class Slam:
             rasterizer: Backend of tracking and mapping.
             live: Never wait for the map: it comes into use when it is ready, and nothing new is mapped before. For a
                 camera that does not wait either; what comes out then depends on the machine's speed.
+            store: Where finished submaps go, and are read back from when their place is seen again; if left out,
+                memory.
         """
         self.config = config
         self._live = live
         self._rasterizer, self._device, self._core = rasterizer, rasterizer.device, rasterizer.reserved
-        generator = torch.Generator().manual_seed(config.seed)
+        self._store = InMemory() if store is None else store
+        self._ids, self._generator = IdSource(), torch.Generator().manual_seed(config.seed)
         self._tracker = Tracker(config.tracker, config.confidence, rasterizer)
-        self._mapper = Mapper(config.mapper, config.confidence, rasterizer, IdSource(), generator)
+        self._mapper = Mapper(config.mapper, config.confidence, rasterizer, self._ids, self._generator)
         self._schedule = Schedule(config.schedule)
+        self._closer = LoopCloser(config.loop, config.tracker, config.confidence, rasterizer, self._store.load_submap)
         self._mapping_thread = ThreadPoolExecutor(1, thread_name_prefix="mapping")
         self._updating: Future[tuple[Submap, MapUpdate]] | None = None
         self._since_mapped = 0
+        self._keeping_thread = ThreadPoolExecutor(1, thread_name_prefix="keeping")
+        self._keeping: Future[Closure] | None = None
+        self._since_sealed = 0
+        self._resumed_at: int | None = None
         self._synchronizes = config.tracker.synchronization != "none"
         self._learns_delay = config.tracker.synchronization == "learnt"
         self.motion = ConstantVelocity()
         self.delay = DepthDelay()
+        self.lost = 0
         self.submap = self._anchored(se3.identity(), index=0)
         self._reference = Reference(self.submap)
         self.atlas = Atlas().with_submap(self.submap.T_world_map)
         self.trajectory = Trajectory()
+        self.closures: tuple[Closure, ...] = ()
+
+    @staticmethod
+    def resumed(config: SlamConfig, rasterizer: Rasterizer, store: SubmapStore, checkpoint: Checkpoint) -> "Slam":
+        """The system as it was when it made a checkpoint; the next frame to step it through is `frame_index`.
+
+        All that follows is what followed then, to the bit.
+        """
+        slam, then = Slam(config, rasterizer, store=store), checkpoint
+        slam.trajectory, slam.atlas, slam.motion, slam.delay = then.trajectory, then.atlas, then.motion, then.delay
+        slam.submap = slam._anchored(then.atlas.T_world_map[then.sealed], index=then.sealed)
+        slam._reference = Reference(measured(store.load_submap(then.reference)), then.T_map_reference, then.exposure)
+        slam._ids.next, slam._resumed_at = then.next_id, then.frame_index
+        slam._generator.set_state(then.generator)
+        if config.loop.enabled:
+            slam._closer.restore(then.sealed - 1, then.edges)
+            slam._keeping = slam._keeping_thread.submit(slam._closer.closed, then.sealed - 1, then.atlas.T_world_map)
+        return slam
 
     def step(self, frame: Frame) -> StepReport:
         """Track, perhaps switch submap, perhaps map; the first frame's camera is the origin of the world."""
-        frame, sealed, clock = frame.to(self._device), None, _Laps()
+        frame, sealed, found, clock = frame.to(self._device), None, None, _Laps()
         self._since_mapped += 1
 
-        # The map that was optimised meanwhile comes into use, after as many frames on a slow machine as on a fast one.
-        ready = not self._updates if self._live else self._schedule.adopts(self._since_mapped)
-        update = self._finished_update() if ready else None
+        # The map that was optimised meanwhile comes into use, and the submaps stand where comparing the last one with
+        # those before has shown them to be: after as many frames on a slow machine as on a fast one.
+        update = self._finished_update() if self._adopts_update else None
+        closure = self._finished_closure() if self._adopts_closure else None
         clock.lap("wait")
 
         # Track: the map stands still, only the camera moves (equations 17 to 19).
-        velocity, stamped = self.motion.steady, frame.depth_delay
-        frame = frame.with_depth_later(self.delay.seconds) if self._learns_delay else frame
-        with self._core():
-            together = synchronized(frame, velocity) if self._synchronizes else frame
-            tracked = self._tracked(together, guess=self.motion.predict(frame.timestamp))
+        resumed = frame.index == self._resumed_at  # it was tracked before the run was interrupted, and anchors a submap
+        tracked = Tracked(se3.identity()) if resumed else self._moved(frame)
         T_map_cam, exposure = tracked.T_map_cam, tracked.exposure
-        advance = self.motion.advanced if tracked.converged else self.motion.coasted
-        self.motion = advance(T_map_cam, frame.timestamp)
-        if self._learns_delay and tracked.converged and tracked.color and tracked.depth:
-            moved = (frame.depth_delay if together is not frame else 0.0) - stamped
-            applied = (velocity * moved).numpy()
-            self.delay = self.delay.observed(self.motion.steady.numpy(), applied, tracked.color, tracked.depth)
         clock.lap("track")
 
-        # Switch: seal the submap and anchor the next one at this camera (equation 16).
+        # Lost for a while: the place is looked up, in this submap and in all before.
+        if self.lost and self.lost % self.config.loop.relocalize_after == 0 and self.config.loop.enabled:
+            update, closure = self._finished_update() or update, self._finished_closure() or closure
+            found = self._closer.relocalized(self._synchronized(frame), self.submap)
+            clock.lap("relocalize")
+        if found is not None:
+            self.lost, tracked = 0, found.tracked
+            T_map_cam, exposure = tracked.T_map_cam, tracked.exposure
+            if found.reference is self.submap:
+                self.motion = self.motion.advanced(T_map_cam, frame.timestamp)
+
+        # Switch: seal the submap and anchor the next one at this camera (equation 16), which may stand elsewhere.
         may_map = tracked.converged and not (self._live and self._updates)
-        if may_map and self._schedule.switches_submap(frame.index, T_map_cam, self.submap) and frame.has_depth:
+        elsewhere = found is not None and found.reference is not self.submap
+        switches = may_map and self._schedule.switches_submap(frame.index, T_map_cam, self.submap) and frame.has_depth
+        if elsewhere or switches:
             fresh = self._finished_update()
+            closure = self._finished_closure() or closure
             clock.lap("wait")
-            if fresh is not None:  # all that follows hangs on this pose: it is found again in the newest map
-                update, anchor = fresh, self._tracked(together, guess=T_map_cam)
+            if (
+                fresh is not None and not elsewhere
+            ):  # all that follows hangs on this pose: found again in the newest map
+                update, anchor = fresh, self._tracked(self._synchronized(frame), guess=T_map_cam)
                 tracked = anchor if anchor.converged else tracked
-                T_map_cam, exposure = tracked.T_map_cam, tracked.exposure
                 clock.lap("track")
-            sealed = self.submap.sealed(self.config.confidence)
-            self._reference = Reference(self.submap, se3.inverse(T_map_cam), tracked.exposure)
-            self.submap = self._anchored(self.submap.T_world_map @ T_map_cam, index=len(self.atlas))
-            self.atlas = self.atlas.with_submap(self.submap.T_world_map)
-            self.motion, T_map_cam, exposure = self.motion.rebased(), se3.identity(), UNCHANGED
+            sealed = self._switched(frame.index, tracked, found.reference if found is not None else None)
+            T_map_cam, exposure = se3.identity(), UNCHANGED
 
         # Map: grow where the view is new, and have it all optimised and judged while the next frames are tracked.
         maps = may_map and self._schedule.maps(self._since_mapped, self.submap)
@@ -163,8 +207,8 @@ class Slam:
             update = self._finished_update() or update
             clock.lap("wait")
             with self._core():
-                together = synchronized(frame, self.motion.steady) if self._synchronizes else frame
-                grown = self._mapper.grown(Keyframe(together, T_map_cam, exposure.relaxed(EXPOSURE_LEAK)), self.submap)
+                keyframe = Keyframe(self._synchronized(frame), T_map_cam, exposure.relaxed(EXPOSURE_LEAK))
+                grown = self._mapper.grown(keyframe, self.submap)
             self.submap, self._since_mapped = grown.submap, 0
             if not grown.first or not len(self._reference.submap):
                 self._refer_to(self.submap)
@@ -174,6 +218,7 @@ class Slam:
             if (raw or self.config.schedule.map_lag == 0) and not self._live:
                 update = self._finished_update()
                 clock.lap("wait")
+        self._since_sealed += 1
 
         row = TrackedPose(
             frame_index=frame.index,
@@ -191,24 +236,46 @@ class Slam:
             mapped=maps,
             update=update,
             sealed=sealed,
+            closure=closure,
+            found=found,
             submap_index=self.submap.index,
             gaussians=len(self.submap),
             seconds=clock.seconds,
         )
 
     def finish(self) -> Submap | None:
-        """The last submap, sealed like all others, or None if nothing was ever mapped."""
+        """The last submap, sealed, kept and compared like all others; None if nothing was ever mapped."""
         self._finished_update()
-        return self.submap.sealed(self.config.confidence) if self.submap.keyframes else None
+        self._finished_closure()
+        if not self.submap.keyframes:
+            return None
+        sealed = self._sealed()
+        self._keeping = self._keeping_thread.submit(self._kept, sealed, None)
+        self._finished_closure()
+        return sealed
 
-    def completed(self, sealed: Submap) -> Submap:
-        """A sealed submap with its holes closed by guesses, if the settings say so: for whoever keeps it.
+    def _moved(self, frame: Frame) -> Tracked:
+        """The frame tracked, and what it tells of motion and of the depth images' delay."""
+        velocity = self.motion.steady
+        with self._core():
+            together = self._synchronized(frame)
+            tracked = self._tracked(together, guess=self.motion.predict(frame.timestamp))
+        if not tracked.converged:
+            self.lost, self.motion = self.lost + 1, self.motion.coasted(tracked.T_map_cam, frame.timestamp)
+            return tracked
+        self.lost, self.motion = 0, self.motion.advanced(tracked.T_map_cam, frame.timestamp)
+        if self._learns_delay and tracked.color and tracked.depth:
+            moved = self.delay.seconds if together.depth is not frame.depth else -frame.depth_delay
+            applied = (velocity * moved).numpy()
+            self.delay = self.delay.observed(self.motion.steady.numpy(), applied, tracked.color, tracked.depth)
+        return tracked
 
-        It takes as long as some frames, reads nothing that changes, and may be called on any thread.
-        """
-        if not self.config.mapper.complete:
-            return sealed
-        return completed(sealed, self.config.mapper.seeding, self.config.confidence, self._rasterizer)
+    def _synchronized(self, frame: Frame) -> Frame:
+        """The frame with its depth as at the instant of its colours, as far as delay and velocity are known now."""
+        if not self._synchronizes:
+            return frame
+        later = frame.with_depth_later(self.delay.seconds) if self._learns_delay else frame
+        return synchronized(later, self.motion.steady)
 
     def _tracked(self, frame: Frame, guess: Pose) -> Tracked:
         """The frame's pose and exposure in the active submap, found in the reference."""
@@ -220,6 +287,50 @@ class Slam:
             T_map_cam=T_map_reference @ tracked.T_map_cam,
             exposure=tracked.exposure.relative_to(reference.exposure) if tracked.converged else UNCHANGED,
         )
+
+    def _switched(self, frame_index: int, tracked: Tracked, elsewhere: Submap | None) -> Submap:
+        """Seal the active submap and begin the next one at a frame tracked in it, or found again in another one."""
+        sealed, index = self._sealed(), len(self.atlas)
+        reference = sealed if elsewhere is None else elsewhere
+        edge = odometry(index, reference.index, tracked.T_map_cam)
+        self.submap = self._anchored(self.atlas.T_world_map[reference.index] @ tracked.T_map_cam, index)
+        self.atlas = self.atlas.with_submap(self.submap.T_world_map)
+        self.motion = self.motion.rebased()
+        self._reference = Reference(reference, se3.inverse(tracked.T_map_cam), tracked.exposure)
+        self._closer.follow(edge)
+        checkpoint = Checkpoint(
+            frame_index=frame_index,
+            sealed=index,
+            trajectory=self.trajectory,
+            atlas=self.atlas,
+            edges=self._closer.edges,
+            motion=self.motion,
+            delay=self.delay,
+            reference=reference.index,
+            T_map_reference=self._reference.T_map_reference,
+            exposure=self._reference.exposure,
+            next_id=self._ids.next,
+            generator=self._generator.get_state(),
+        )
+        self._keeping = self._keeping_thread.submit(self._kept, sealed, checkpoint)
+        self._since_sealed = 0
+        return sealed
+
+    def _sealed(self) -> Submap:
+        """The active submap as it is kept: calibrated (Eq. 16), and where it stands by now."""
+        sealed = self.submap.sealed(self.config.confidence)
+        return replace(sealed, T_world_map=self.atlas.T_world_map[sealed.index])
+
+    def _kept(self, sealed: Submap, checkpoint: Checkpoint | None) -> Closure:
+        """Put a finished submap away, its holes closed by guesses, and compare it; runs beside all else."""
+        whole = sealed
+        if self.config.mapper.complete:
+            whole = completed(sealed, self.config.mapper.seeding, self.config.confidence, self._rasterizer)
+        self._store.keep(whole, checkpoint)
+        atlas = self.atlas if checkpoint is None else checkpoint.atlas
+        if not self.config.loop.enabled:
+            return Closure(sealed.index)
+        return self._closer.closed(sealed.index, atlas.T_world_map)
 
     def _updated(self, grown: Grown) -> tuple[Submap, MapUpdate]:
         """Optimise (equations 20 to 24), then judge what moved (equations 4 to 15); runs beside tracking."""
@@ -235,6 +346,18 @@ class Slam:
         """Whether a mapping update is being worked on."""
         return self._updating is not None and not self._updating.done()
 
+    @property
+    def _adopts_update(self) -> bool:
+        """Whether the update under way comes into use now."""
+        return not self._updates if self._live else self._schedule.adopts(self._since_mapped)
+
+    @property
+    def _adopts_closure(self) -> bool:
+        """Whether the closure under way comes into use now."""
+        if self._live:
+            return self._keeping is not None and self._keeping.done()
+        return self._since_sealed >= self.config.loop.lag
+
     def _finished_update(self) -> MapUpdate | None:
         """Wait for the update that is under way, if any, and use its map from now on."""
         if self._updating is None:
@@ -243,6 +366,15 @@ class Slam:
         self._updating = None
         self._refer_to(self.submap)
         return update
+
+    def _finished_closure(self) -> Closure | None:
+        """Wait for the closure that is under way, if any; the submaps stand where it says from now on."""
+        if self._keeping is None:
+            return None
+        closure, self._keeping = self._keeping.result(), None
+        self.atlas = self.atlas.corrected(closure.corrections)
+        self.closures = (*self.closures, closure)
+        return closure
 
     def _refer_to(self, submap: Submap) -> None:
         """Track against the active submap from now on, if there is anything in it."""
@@ -257,7 +389,7 @@ class _Laps:
     """Wall time by stage."""
 
     def __init__(self) -> None:
-        self.seconds = {"wait": 0.0, "track": 0.0, "grow": 0.0}
+        self.seconds = {"wait": 0.0, "track": 0.0, "relocalize": 0.0, "grow": 0.0}
         self._last = time.perf_counter()
 
     def lap(self, stage: str) -> None:

@@ -11,6 +11,7 @@ from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.config import SlamConfig
 from tcgsplat.datasets.sequence import Sequence
 from tcgsplat.geometry import se3
+from tcgsplat.loop.settings import LoopConfig
 from tcgsplat.mapping.schedule import ScheduleConfig
 from tcgsplat.mapping.seeding import SeedingConfig
 from tcgsplat.mapping.settings import MapperConfig
@@ -33,6 +34,7 @@ CONFIG = SlamConfig(
     ),
     schedule=ScheduleConfig(map_every=4, map_lag=4, submap_by="motion", submap_distance=0.15, submap_angle=50.0),
     confidence=ConfidenceConfig(),
+    loop=LoopConfig(enabled=False),
     seed=3,
 )
 SEQUENCE = RoomSequence(tuple(walk(34)))
@@ -92,7 +94,7 @@ def test_the_first_camera_is_the_origin(walked: Run) -> None:
 
 def test_reports_tell_what_happened(walked: Run) -> None:
     for report in walked.reports:
-        assert report.seconds.keys() == {"wait", "track", "grow"}
+        assert report.seconds.keys() == {"wait", "track", "relocalize", "grow"}
         assert all(seconds >= 0 for seconds in report.seconds.values())
     mapped = [report.frame_index for report in walked.reports if report.mapped]
     switched = [report.frame_index for report in walked.reports if report.sealed]

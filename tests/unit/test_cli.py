@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,9 @@ from tcgsplat.cli.usage import UsageError
 from tcgsplat.config import SlamConfig, from_toml
 from tcgsplat.errors import ArchiveError, ConfigError
 from tcgsplat.geometry import se3
+from tcgsplat.loop.closer import Closure, odometry
 from tcgsplat.presets import preset
+from tcgsplat.scene.trajectory import TrackedPose, Trajectory
 from tcgsplat.slam import StepReport
 from tcgsplat.storage.run_directory import RunDirectory
 from tcgsplat.tracking.tracker import Tracked
@@ -96,7 +99,7 @@ def test_threads_are_told_to_sleep_before_anything_is_imported(given: dict[str, 
         (["bench", "track"], 2, "FOLDER"),
         (["bench", "track", "nowhere"], 1, "tcgsplat: no folder nowhere; check the path\n"),
         (["bench", "track", "nowhere", "--mapper.iteration", "3"], 2, "there is no setting mapper.iteration; did you"),
-        (["bench", "render", "--mapper.iterations", "3"], 2, "bench render has no settings, but --mapper.iterations"),
+        (["bench", "render", "--mapper.iterations", "3"], 2, "this bench has no settings, but --mapper.iterations"),
         (["presets", "default", "--mapper.iterations", "3"], 2, "--mapper.iterations"),
         (["presets", "papier"], 1, "tcgsplat: there is no preset papier; "),
     ],
@@ -164,7 +167,9 @@ def test_flags_may_be_written_in_all_usual_ways(tmp_path: Path, capsys: pytest.C
 
 def report(index: int, lost: str = "", *, seconds: float = 0.01) -> StepReport:
     tracked = Tracked(se3.identity(), lost)
-    return StepReport(index, tracked, False, None, None, 0, 1000 + index, {"track": seconds, "map": 2 * seconds})
+    return StepReport(
+        index, tracked, False, None, None, None, None, 0, 1000 + index, {"track": seconds, "map": 2 * seconds}
+    )
 
 
 def test_losing_the_way_is_told_once_not_for_every_frame(capsys: pytest.CaptureFixture[str]):
@@ -211,19 +216,24 @@ def test_the_first_frame_does_not_count_in_times():
     tally = summary.Tally()
     for index, (seconds, whole) in enumerate([(5.0, 20.0), (0.010, 0.04), (0.010, 0.04), (0.040, 0.13)]):
         tally.count(report(index, "dark" if index == 2 else "", seconds=seconds), whole)
-    result = tally.summary(submaps=2, gaussians=30, seconds=21.0, interrupted=False)
+    rows = tuple(TrackedPose(i, i / 30, 0, se3.identity(), lost=i == 2) for i in range(4))
+    edge = odometry(1, 0, se3.identity())
+    closures = [Closure(0), Closure(1, edges=(edge, *[replace(edge, loop=True)] * 3), rejected=(edge,), seconds=0.5)]
+    result = tally.summary(Trajectory(rows), closures, submaps=2, gaussians=30, seconds=21.0, interrupted=False)
+    assert (result.loops, result.loops_rejected, result.ms_closure) == (2, 1, 250.0)
+    assert result.seconds_lost == pytest.approx(1 / 30)
     assert (result.frames, result.frames_lost, result.submaps, result.gaussians) == (4, 1, 2, 30)
     assert result.ms_per_frame == pytest.approx(70.0)
     assert result.ms_per_frame_median == pytest.approx(40.0)
     assert result.stage_ms == pytest.approx({"track": 20.0, "map": 40.0})
-    assert str(result) == "4 frames in 21.0 s (70 ms a frame), 1 lost, 2 submaps, 30 Gaussians"
+    assert str(result) == "4 frames in 21.0 s (70 ms a frame), 1 lost, 2 submaps, 2 loops closed, 30 Gaussians"
     assert json.loads(json.dumps(result.to_dict()))["versions"]["torch"] == torch.__version__
     assert 50 < (result.peak_rss_mb or 0) < 100_000
     assert "core" in result.machine
 
 
 def test_a_run_of_no_frames_still_has_a_summary():
-    result = summary.Tally().summary(submaps=0, gaussians=0, seconds=0.1, interrupted=True)
+    result = summary.Tally().summary(Trajectory(), (), submaps=0, gaussians=0, seconds=0.1, interrupted=True)
     assert (result.frames, result.ms_per_frame, result.interrupted) == (0, 0.0, True)
 
 

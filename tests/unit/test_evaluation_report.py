@@ -55,7 +55,10 @@ class Recorded:
         return len(self.frames)
 
     def __iter__(self) -> Iterator[Frame]:
-        return iter(self.frames)
+        return self.frames_from(0)
+
+    def frames_from(self, first: int) -> Iterator[Frame]:
+        return iter(self.frames[first:])
 
     def frame(self, index: int) -> Frame:
         self.asked.append(index)

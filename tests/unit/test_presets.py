@@ -11,6 +11,7 @@ PAPER = ("paper-replica", "paper-tum", "paper-scannet")
 # Neither the paper nor the base system has these: when a frame is lost, and parts that the paper presets do not use.
 OURS_EVERYWHERE = {
     "tracker.max_step", "tracker.max_turn", "tracker.min_overlap", "tracker.min_agreement", "tracker.min_correlation",
+    "loop.min_coverage", "loop.min_agreement", "loop.min_correlation", "loop.lag", "loop.relocalize_after",
     "mapper.seeding.spacing", "mapper.seeding.footprint", "mapper.seeding.flatness", "mapper.seeding.behind",
 }  # fmt: skip
 

@@ -10,7 +10,11 @@ from test_cli import report
 from tcgsplat.cli import summary
 from tcgsplat.cli.progress import RunProgress
 from tcgsplat.datasets.playback import Arrival
+from tcgsplat.geometry import se3
+from tcgsplat.scene.trajectory import TrackedPose, Trajectory
 from tcgsplat.slam import MapUpdate
+
+PATH = Trajectory(tuple(TrackedPose(i, i / 30, 0, se3.identity()) for i in range(3)))
 
 
 def test_dropped_frames_are_in_the_progress_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
@@ -32,7 +36,7 @@ def test_a_summary_in_real_time_tells_how_far_behind_it_was():
     for index, (dropped, captured, held) in enumerate(arrivals):
         tally.follow(Arrival(Room().frame(), captured, dropped, 0.0, held), captured + 0.02 * (index + 1))
         tally.count(report(index), 0.02)
-    ended = tally.summary(submaps=1, gaussians=30, seconds=0.25, interrupted=False)
+    ended = tally.summary(PATH, (), submaps=1, gaussians=30, seconds=0.25, interrupted=False)
     result = replace(ended, realtime=True)
     assert (result.frames, result.frames_dropped, result.frames_total) == (3, 3, 6)
     assert (result.ms_late_median, result.ms_late_p95) == pytest.approx((40.0, 58.0))
@@ -45,8 +49,8 @@ def test_an_ordinary_summary_has_no_delay():
     tally = summary.Tally()
     tally.follow(Arrival(Room().frame()), 5.0)
     tally.count(report(0), 0.02)
-    told = tally.summary(submaps=1, gaussians=30, seconds=0.25, interrupted=False).to_dict()
-    expected = {"realtime": False, "frames_dropped": 0, "frames_total": 1, "ms_late_median": None, "ms_late_p95": None}
+    told = tally.summary(PATH, (), submaps=1, gaussians=30, seconds=0.25, interrupted=False).to_dict()
+    expected = {"realtime": False, "frames_dropped": 0, "frames_total": 3, "ms_late_median": None, "ms_late_p95": None}
     assert expected.items() <= told.items()
 
 
@@ -55,9 +59,11 @@ def test_mapping_updates_are_timed_apart_from_the_frames():
     for index, ms in enumerate([None, 30.0, None, 50.0]):
         update = None if ms is None else MapUpdate(index, 1, 1, 0.1, ms / 1000)
         tally.count(replace(report(index), update=update), 0.02)
-    assert tally.summary(submaps=1, gaussians=30, seconds=0.25, interrupted=False).ms_update == pytest.approx(40.0)
+    assert tally.summary(PATH, (), submaps=1, gaussians=30, seconds=0.25, interrupted=False).ms_update == pytest.approx(
+        40.0
+    )
 
 
 def test_a_camera_that_gave_nothing_has_a_summary_too():
-    result = summary.Tally().summary(submaps=0, gaussians=0, seconds=0.1, interrupted=True)
+    result = summary.Tally().summary(Trajectory(), (), submaps=0, gaussians=0, seconds=0.1, interrupted=True)
     assert str(replace(result, realtime=True)).endswith("; 0 of 0 frames dropped (0.0 %)")

@@ -21,6 +21,7 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "demo": "make a synthetic apartment, map it, and show how well that went",
         "refine": "optimise the map of a finished run further, for better pictures",
         "eval": "score a run: report.json, contact sheet, trajectory plot",
+        "localize": "find where in a finished map pictures were taken",
         "export": "write a run's map as one PLY file and its trajectory as text",
         "synth": "write the synthetic apartment as an RGB-D folder",
         "bench": "measure how long the stages take on this machine",

@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,14 +18,11 @@ import torch
 from tcgsplat.cli.kernels import compile_kernels
 from tcgsplat.cli.progress import RunProgress, say
 from tcgsplat.cli.summary import Summary, Tally
-from tcgsplat.config import SlamConfig, to_toml
+from tcgsplat.config import SlamConfig, from_toml, settings, to_toml
 from tcgsplat.datasets import Sequence, open_sequence
 from tcgsplat.datasets.playback import Arrival, Clock, in_turn, play
 from tcgsplat.errors import ArchiveError
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.scene.atlas import Atlas
-from tcgsplat.scene.submap import Submap
-from tcgsplat.scene.trajectory import Trajectory
 from tcgsplat.slam import Slam, StepReport
 from tcgsplat.storage import atomic
 from tcgsplat.storage.run_directory import RunDirectory
@@ -75,6 +71,24 @@ class Part:
             raise ArchiveError(f"cannot read {path} ({error}); run again") from error
 
 
+def resume(path: Path, config: SlamConfig, folder: Path, part: Part) -> RunDirectory:
+    """The run directory of the same run, which was interrupted.
+
+    Raises:
+        ArchiveError: if the run that is there has other settings or other data, or has ended.
+    """
+    run = RunDirectory.open(path)
+    if run.summary() and not run.summary().get("interrupted"):
+        raise ArchiveError(f"the run in {path} has ended, and there is nothing to resume; use --overwrite to repeat it")
+    if Path(run.sequence) != folder.expanduser().resolve() or Part.of(run) != part:
+        raise ArchiveError(f"the run in {path} is of {run.sequence}, {Part.of(run)}; resume it with the same data")
+    now, then = settings(config), settings(from_toml(run.config_toml))
+    other = [f"{name} was {then[name]} and is {now[name]}" for name in now if now[name] != then[name]]
+    if other:
+        raise ArchiveError(f"the run in {path} has other settings: {'; '.join(other)}; resume it with the same ones")
+    return run
+
+
 def begin(path: Path, config: SlamConfig, folder: Path, part: Part, *, overwrite: bool) -> RunDirectory:
     """A new run directory that knows its settings and its data.
 
@@ -99,7 +113,7 @@ def recorded(
     *,
     realtime: bool = False,
 ) -> Summary:
-    """A whole run with progress on the terminal; its summary is on disk too.
+    """A whole run with progress on the terminal, or what is left of one; its summary is on disk too.
 
     Args:
         sequence: The frames.
@@ -118,18 +132,32 @@ def recorded(
     compiling = compile_kernels(
         config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds")
     )
+    checkpoint = run.checkpoint()
+    if checkpoint is None:
+        slam = Slam(config, rasterizer, live=realtime, store=run)
+    else:
+        slam = Slam.resumed(config, rasterizer, run, checkpoint)
+        say(f"going on from frame {checkpoint.frame_index}, after {checkpoint.sealed} submaps")
+    frames = sequence.frames_from(0 if checkpoint is None else checkpoint.frame_index)
     try:
         with (
             RunProgress(len(sequence)) as progress,
             stopping_on_interrupt() as stop,
             # `stop.wait`, so that nobody has to wait for the camera's next frame when the run is to stop
-            closing(play(sequence, Clock(sleep=stop.wait)) if realtime else in_turn(sequence)) as arrivals,
+            closing(play(frames, Clock(sleep=stop.wait)) if realtime else in_turn(frames)) as arrivals,
         ):
-            summary = record(Slam(config, rasterizer, live=realtime), arrivals, run, progress.observe, stop.is_set)
+            summary = record(slam, arrivals, run, progress.observe, stop.is_set)
     except KeyboardInterrupt as interrupt:
         saved = f"{run.submap_count} submaps sealed before are saved"
         raise KeyboardInterrupt(f"stopped at once; {saved}: {run.path}") from interrupt
-    summary = replace(summary, realtime=realtime, seconds_compiling=compiling, backend=rasterizer.name, preset=preset)
+    summary = replace(
+        summary,
+        resumed_at=None if checkpoint is None else checkpoint.frame_index,
+        realtime=realtime,
+        seconds_compiling=compiling,
+        backend=rasterizer.name,
+        preset=preset,
+    )
     if summary.seconds_held > MAX_HELD * summary.seconds:
         logger.warning(
             "the images could not be read fast enough: for %.1f of %.1f s the playback stood still, as no camera would",
@@ -146,53 +174,37 @@ def record(
     observe: Callable[[StepReport, int], object],
     stopped: Callable[[], bool],
 ) -> Summary:
-    """Step SLAM through the frames; sealed submaps, completed, and the path so far are written beside the next ones.
+    """Step SLAM through the frames.
 
     Args:
-        slam: A fresh system.
+        slam: The system, which keeps its submaps in the run directory.
         arrivals: Frames in order of time.
-        run: Where to write.
+        run: Where to write the path at the end.
         observe: Called with every report, and the number of frames dropped before it.
         stopped: Asked after every frame; if true, what there is gets sealed and the run ends.
 
     Returns:
         The summary, not yet written: the caller knows more about the run.
     """
-    tally, gaussians = Tally(), 0
-
-    def write(sealed: Submap, trajectory: Trajectory, atlas: Atlas) -> int:
-        submap = slam.completed(sealed)
-        run.write_submap(submap)
-        run.write_trajectory(trajectory, atlas)
-        return len(submap)
-
+    tally = Tally()
     started = before = time.perf_counter()
-    with ThreadPoolExecutor(1, thread_name_prefix="writer") as writer:
-        writing: Future[int] | None = None
-        for arrival in arrivals:
-            report = slam.step(arrival.frame)
-            tally.follow(arrival, time.perf_counter())
-            if report.sealed is not None:
-                if writing is not None:
-                    gaussians += writing.result()  # one at a time: memory holds no more, and no failure is missed
-                writing = writer.submit(write, report.sealed, slam.trajectory, slam.atlas)
-            observe(report, arrival.dropped)
-            now = time.perf_counter()
-            tally.count(report, now - before - arrival.waited)
-            before = now
-            if stopped():
-                break
-        if writing is not None:
-            gaussians += writing.result()
+    for arrival in arrivals:
+        report = slam.step(arrival.frame)
+        tally.follow(arrival, time.perf_counter())
+        observe(report, arrival.dropped)
+        now = time.perf_counter()
+        tally.count(report, now - before - arrival.waited)
+        before = now
+        if stopped():
+            break
     interrupted = stopped()
-    last = slam.finish()
-    if last is not None:
-        gaussians += write(last, slam.trajectory, slam.atlas)
-    else:
-        run.write_trajectory(slam.trajectory, slam.atlas)
+    slam.finish()
+    run.write_trajectory(slam.trajectory, slam.atlas)
     summary = tally.summary(
+        slam.trajectory,
+        slam.closures,
         submaps=run.submap_count,
-        gaussians=gaussians,
+        gaussians=run.gaussians,
         seconds=time.perf_counter() - started,
         interrupted=interrupted,
     )

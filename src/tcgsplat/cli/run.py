@@ -7,6 +7,7 @@ from pathlib import Path
 import tyro
 
 from tcgsplat.cli.flags import Flags
+from tcgsplat.cli.usage import UsageError
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,9 @@ class Args:
     """Of all randomness; that of the preset if left out."""
     realtime: bool = False
     """Play it by its time stamps, as a live camera: frames that come while the system is busy are dropped."""
+    resume: bool = False
+    """Go on with a run that was interrupted or killed, after its last complete submap, with the same command but for
+    this flag; what comes out is the same as without the interruption. Where there is no run yet, one begins."""
     overwrite: bool = False
     """Replace the run directory if there is a run in it."""
     settings: Flags = field(default_factory=dict)
@@ -50,16 +54,21 @@ class Args:
 
 def command(args: Args) -> int:
     """Run, and say in one line what came of it."""
-    from tcgsplat.cli.recorder import Part, begin, recorded
+    from tcgsplat.cli.recorder import Part, begin, recorded, resume
     from tcgsplat.cli.settings import resolved
     from tcgsplat.render.backends import open_rasterizer
 
+    if args.resume and (args.overwrite or args.realtime):
+        raise UsageError("--resume goes with neither --overwrite nor --realtime, which repeats nothing; leave one out")
     config = resolved(args.preset, args.config, args.settings, args.seed)
     part = Part(args.start, args.stride, args.limit)
     sequence = part.open(args.folder)
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     out = args.out or Path("runs") / sequence.name
-    run = begin(out, config, args.folder, part, overwrite=args.overwrite)
+    if args.resume and (out / "run.json").exists():
+        run = resume(out, config, args.folder, part)
+    else:
+        run = begin(out, config, args.folder, part, overwrite=args.overwrite)
     summary = recorded(sequence, config, rasterizer, run, args.preset, realtime=args.realtime)
     if summary.interrupted:
         sys.stderr.write(f"tcgsplat: stopped; saved {summary}: {run.path}\n")

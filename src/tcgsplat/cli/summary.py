@@ -3,14 +3,18 @@
 import platform
 import statistics
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from tcgsplat.datasets.playback import Arrival
+from tcgsplat.loop.closer import Closure
 from tcgsplat.render.numba_cpu.workers import available_cores
+from tcgsplat.scene.trajectory import Trajectory
 from tcgsplat.slam import StepReport
 
 PACKAGES = ("tcgsplat", "torch", "numba", "numpy")
@@ -22,10 +26,16 @@ class Summary:
 
     frames: int
     frames_lost: int
+    seconds_lost: float
+    """Of the recording, in which nobody knew where the camera was."""
     submaps: int
     """Sealed and on disk."""
     gaussians: int
     """In all submaps."""
+    loops: int
+    """Pairs of submaps that were registered and are believed."""
+    loops_rejected: int
+    """Pairs that were registered and contradict the rest."""
     seconds: float
     """Wall time from the first frame's reading to the last file, without compiling the kernels."""
     ms_per_frame: float
@@ -34,12 +44,16 @@ class Summary:
     """Of the same."""
     stage_ms: dict[str, float]
     """Mean over all frames of each stage of `Slam.step`, by its name."""
+    ms_closure: float
+    """Mean over the submaps: comparing one with those before it, on a thread of its own."""
     ms_update: float
     """Mean over the mapping updates, which are made on a thread of their own; the first one included."""
     interrupted: bool
     """Stopped by Ctrl-C; what had been seen by then is sealed and saved."""
     peak_rss_mb: float | None
     """Most memory that the process has held, MB of 2^20 bytes; None where the system does not tell."""
+    resumed_at: int | None = None
+    """Frame at which an interrupted run went on; all times are of what came after."""
     realtime: bool = False
     """Played by its time stamps, as from a live camera."""
     frames_dropped: int = 0
@@ -67,7 +81,8 @@ class Summary:
         """One line for a person."""
         return (
             f"{self.frames} frames in {self.seconds:.1f} s ({self.ms_per_frame:.0f} ms a frame), "
-            f"{self.frames_lost} lost, {self.submaps} submap{'s' * (self.submaps != 1)}, {self.gaussians} Gaussians"
+            f"{self.frames_lost} lost, {self.submaps} submap{'s' * (self.submaps != 1)}, "
+            f"{self.loops} loop{'s' * (self.loops != 1)} closed, {self.gaussians} Gaussians"
             f"{self._behind() if self.realtime else ''}"
         )
 
@@ -86,8 +101,6 @@ class Summary:
 class Tally:
     """Counts and times of the reports so far."""
 
-    frames: int = 0
-    lost: int = 0
     dropped: int = 0
     held: float = 0.0
     """Seconds."""
@@ -102,8 +115,6 @@ class Tally:
 
     def count(self, report: StepReport, seconds: float) -> None:
         """Add a report, and the wall time that its frame took."""
-        self.frames += 1
-        self.lost += not report.tracked.converged
         self.ms.append(1000.0 * seconds)
         for stage, duration in report.seconds.items():
             self.stage_ms.setdefault(stage, []).append(1000.0 * duration)
@@ -117,13 +128,29 @@ class Tally:
         if arrival.captured is not None:
             self.late.append(1000.0 * (stepped - arrival.captured))
 
-    def summary(self, *, submaps: int, gaussians: int, seconds: float, interrupted: bool) -> Summary:
+    def summary(
+        self,
+        trajectory: Trajectory,
+        closures: Sequence[Closure],
+        *,
+        submaps: int,
+        gaussians: int,
+        seconds: float,
+        interrupted: bool,
+    ) -> Summary:
         """Of the whole run."""
+        rows = trajectory.rows
+        loops = [edge for edge in closures[-1].edges if edge.loop] if closures else []
+        rejected = len(closures[-1].rejected) if closures else 0
         return Summary(
-            frames=self.frames,
-            frames_lost=self.lost,
+            frames=len(rows),
+            frames_lost=sum(row.lost for row in rows),
+            seconds_lost=sum(b.timestamp - a.timestamp for a, b in pairwise(rows) if a.lost),
             submaps=submaps,
             gaussians=gaussians,
+            loops=len(loops) - rejected,
+            loops_rejected=rejected,
+            ms_closure=statistics.fmean([1e3 * closure.seconds for closure in closures] or [0.0]),
             seconds=seconds,
             ms_per_frame=statistics.fmean(_warm(self.ms)),
             ms_per_frame_median=statistics.median(_warm(self.ms)),
@@ -131,7 +158,7 @@ class Tally:
             ms_update=statistics.fmean(self.update_ms or [0.0]),
             interrupted=interrupted,
             frames_dropped=self.dropped,
-            frames_total=self.frames + self.dropped,
+            frames_total=len(rows) + self.dropped,
             ms_late_median=statistics.median(self.late) if self.late else None,
             ms_late_p95=float(np.percentile(self.late, 95)) if self.late else None,
             seconds_held=self.held,

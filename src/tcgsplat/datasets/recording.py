@@ -77,9 +77,13 @@ class Recording:
         return len(self.pairs)
 
     def __iter__(self) -> Iterator[Frame]:
+        """All frames in order."""
+        return self.frames_from(0)
+
+    def frames_from(self, first: int) -> Iterator[Frame]:
         """Frames in order, decoded ahead in one thread; those that cannot be read are skipped with a warning."""
         with ThreadPoolExecutor(max_workers=1, thread_name_prefix="read-ahead") as reader:
-            indices = iter(range(len(self)))
+            indices = iter(range(first, len(self)))
             ahead = deque((i, reader.submit(self.frame, i)) for i in islice(indices, READ_AHEAD))
             while ahead:
                 index, reading = ahead.popleft()

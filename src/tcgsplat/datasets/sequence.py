@@ -30,6 +30,10 @@ class Sequence(Protocol):
         """Frames in order of time; `Frame.index` counts the listed ones from 0, so a skipped one leaves a gap."""
         ...
 
+    def frames_from(self, first: int) -> Iterator[Frame]:
+        """The same from one index on."""
+        ...
+
     def frame(self, index: int) -> Frame:
         """The frame of one index, out of turn.
 

@@ -59,6 +59,12 @@ def inverse(T: Pose) -> Pose:
     return torch.cat((top, T[3:]), dim=0)
 
 
+def adjoint(T: Pose) -> Float[Tensor, "6 6"]:
+    """What carries tangents through a transform: T exp(xi) = exp(adjoint(T) xi) T."""
+    R, zero = T[:3, :3], torch.zeros_like(T[:3, :3])
+    return torch.cat((torch.cat((R, skew(T[:3, 3]) @ R), dim=1), torch.cat((zero, R), dim=1)))
+
+
 def from_rotation_translation(R: Float[Tensor, "3 3"], t: Float[Tensor, "3"]) -> Pose:
     """Put a rotation and a translation (metres) together."""
     bottom = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=R.dtype, device=R.device)

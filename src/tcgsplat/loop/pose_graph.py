@@ -4,10 +4,10 @@ What is minimised is truncated least squares: the chi2 of the odometry, plus tha
 cheaper, the price of not believing it, the chi2 that one right edge in a hundred exceeds. So n edges that agree are
 believed against a drift of up to 4.1 sqrt(n) standard deviations of the odometry between their ends, and not beyond.
 
-gtsam finds the poses (Levenberg-Marquardt); which edges to believe is decided here, since gtsam's graduated
-non-convexity judges an edge by what is left of its residual after it has pulled. An edge stiffer than the chain that it
-closes pulls the chain along and leaves nothing: alone, it is believed however wrong. Here an edge is judged by what all
-others lead to expect before it pulls.
+gtsam finds the poses (Levenberg-Marquardt); which edges to believe is a search over sets of them, from what the odometry
+alone leads to expect. gtsam's graduated non-convexity lowers the same sum by weights and does not ask at the end what
+belief in an edge costs: in 60 random graphs with 30 loop edges it believed 25 of the 801 false ones, and this search 2.
+With four or eight loop edges the two are alike. See `solved` for what is asked of the odometry.
 """
 
 from collections.abc import Sequence
@@ -79,6 +79,9 @@ def solved(T_world_map: Sequence[Pose], edges: Sequence[Edge], *, inlier_probabi
     node if there is no loop edge, if the poses given are already the best, or if the optimiser fails, which rejects all
     loop edges. A loop edge that alone joins two parts of the map is believed: nothing speaks against it. The order of
     the edges does not matter, and the same input gives the same bits.
+
+    The odometry must not promise too much. Of right loop edges one in a hundred is rejected if its information is true,
+    but one in ten if its errors are 1.5 times what it says, and nearly half if they are twice that.
 
     Args:
         T_world_map: One float64 pose a node; where the search starts.
@@ -320,7 +323,8 @@ def _surprise(table: _Table) -> Float[Tensor, " n"]:
 
 
 def _inverse(matrix: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
-    """Of a symmetric positive definite matrix, by torch, whose threads sleep while they wait: numpy's, which do not,
-    took 80 ms instead of 1 on two busy cores.
+    """Of a symmetric positive definite matrix.
+
+    By torch, whose threads sleep while they wait: numpy's do not, and took 80 ms instead of 1 on two busy cores.
     """
     return torch.cholesky_inverse(torch.linalg.cholesky(matrix))

@@ -71,12 +71,12 @@ class IdSource:
     """Unique Gaussian ids for one run."""
 
     def __init__(self, first: int = 0) -> None:
-        self._next = first
+        self.next = first
 
     def take(self, count: int) -> Tensor:
         """The next `count` ids, int64."""
-        ids = torch.arange(self._next, self._next + count)
-        self._next += count
+        ids = torch.arange(self.next, self.next + count)
+        self.next += count
         return ids
 
 

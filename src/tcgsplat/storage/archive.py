@@ -11,7 +11,7 @@ Gaussians, confidence and poses come back bit by bit. Keyframe images are PNG in
 
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import astuple, fields
 from pathlib import Path
 
@@ -47,15 +47,16 @@ def write_arrays(path: Path, kind: str, arrays: Mapping[str, Array]) -> None:
         np.savez(file, allow_pickle=False, kind=np.array(kind), version=np.array(VERSION), **arrays)
 
 
-def read_arrays(path: Path, kind: str) -> dict[str, Array]:
-    """Read back what `write_arrays` wrote, all of it, checked against the checksums of the file.
+def read_arrays(path: Path, kind: str, names: Collection[str] | None = None) -> dict[str, Array]:
+    """Read back what `write_arrays` wrote, all of it or some arrays, checked against the checksums of the file.
 
     Raises:
         ArchiveError: if the file is missing, truncated, damaged, of another kind or of another version.
     """
     try:
         with path.open("rb") as file, NpzFile(file, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+            wanted = archive.files if names is None else {"kind", "version", *names}.intersection(archive.files)
+            arrays = {name: archive[name] for name in wanted}
     except FileNotFoundError as error:
         raise ArchiveError(f"no file {path}; give a run directory that holds it") from error
     except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
@@ -106,6 +107,15 @@ def read_submap(path: Path) -> Submap:
         )
     except KeyError as error:
         raise ArchiveError(f"{path} lacks the entry {error}; delete it and run again") from error
+
+
+def submap_size(path: Path) -> int:
+    """How many Gaussians a submap's file holds; nothing else of it is read.
+
+    Raises:
+        ArchiveError: as `read_submap`.
+    """
+    return len(read_arrays(path, "submap", ("gaussians.ids",))["gaussians.ids"])
 
 
 def _array(tensor: Tensor) -> Array:

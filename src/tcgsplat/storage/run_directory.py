@@ -4,6 +4,7 @@
       run.json           what this folder is: {"kind": "run", "version": 1, "sequence": path of the data}
       config.toml        the resolved settings
       submaps/0000.npz   one sealed submap each, with its keyframes (see `archive`)
+      checkpoint.npz     what `run --resume` goes on from: the state after the last of these submaps
       trajectory.npz     exact: pose of every frame in its submap, and pose of every submap in the world
       trajectory.txt     the same composed: camera to world, TUM format
       summary.json       at the end only: frames, seconds, peak_rss_mb, stage_ms, ...
@@ -15,19 +16,16 @@ Every file is complete or absent. A submap's file is written before the trajecto
 
 import json
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-
-import numpy as np
-import torch
 
 from tcgsplat.errors import ArchiveError
 from tcgsplat.scene.atlas import Atlas
-from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.submap import Submap
-from tcgsplat.scene.trajectory import TrackedPose, Trajectory, format_tum
+from tcgsplat.scene.trajectory import Trajectory, format_tum
 from tcgsplat.storage import archive, atomic
-from tcgsplat.tensors import Pose
+from tcgsplat.storage.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from tcgsplat.storage.trajectories import trajectory_arrays, trajectory_of
 
 
 @dataclass(frozen=True)
@@ -99,6 +97,34 @@ class RunDirectory:
         """Put a sealed submap on disk."""
         archive.write_submap(self._submap_path(submap.index), submap)
 
+    def keep(self, submap: Submap, checkpoint: Checkpoint | None) -> None:
+        """Put a sealed submap on disk, and then the path so far and the state that a run can go on from."""
+        self.write_submap(submap)
+        if checkpoint is not None:
+            self.write_trajectory(checkpoint.trajectory, checkpoint.atlas)
+            write_checkpoint(self.path / "checkpoint.npz", checkpoint)
+
+    def checkpoint(self) -> Checkpoint | None:
+        """The state after the last complete submap, or None if there is no such yet.
+
+        Raises:
+            ArchiveError: if its file is damaged or of another version, or one of the submaps is gone.
+        """
+        path = self.path / "checkpoint.npz"
+        if not path.exists():
+            return None
+        found = read_checkpoint(path)
+        if self.submap_count < found.sealed:
+            raise ArchiveError(
+                f"{self.path} has lost submap {self.submap_count} of {found.sealed}; run again with --overwrite"
+            )
+        return found
+
+    @property
+    def gaussians(self) -> int:
+        """In all sealed submaps."""
+        return sum(archive.submap_size(self._submap_path(index)) for index in range(self.submap_count))
+
     def load_submap(self, index: int) -> Submap:
         """A sealed submap, standing where the last written trajectory has it.
 
@@ -111,29 +137,12 @@ class RunDirectory:
 
     def write_trajectory(self, trajectory: Trajectory, atlas: Atlas) -> None:
         """Put the path so far on disk, exact (`trajectory.npz`) and in the world as text (`trajectory.txt`)."""
-        rows = trajectory.rows
-        archive.write_arrays(
-            self.path / "trajectory.npz",
-            "trajectory",
-            {
-                "frame_index": np.array([row.frame_index for row in rows], dtype=np.int64),
-                "timestamp": np.array([row.timestamp for row in rows], dtype=np.float64),
-                "submap_index": np.array([row.submap_index for row in rows], dtype=np.int64),
-                "lost": np.array([row.lost for row in rows], dtype=np.bool_),
-                "mapped": np.array([row.mapped for row in rows], dtype=np.bool_),
-                "exposure": np.array([astuple(row.exposure) for row in rows], dtype=np.float64).reshape(-1, 2),
-                "T_map_cam": _stacked([row.T_map_cam for row in rows]),
-                "T_world_map": _stacked(list(atlas.T_world_map)),
-            },
-        )
-        text = format_tum([row.timestamp for row in rows], trajectory.world(atlas))
+        archive.write_arrays(self.path / "trajectory.npz", "trajectory", trajectory_arrays(trajectory, atlas))
+        text = format_tum([row.timestamp for row in trajectory.rows], trajectory.world(atlas))
         atomic.write_text(self.path / "trajectory.txt", text)
 
     def trajectory(self) -> tuple[Trajectory, Atlas]:
         """The path and the submap poses as last written; both empty if the run has sealed nothing yet.
-
-        A run of an older tcgsplat does not say which frames it mapped: then no row is `mapped`, while in any other run
-        at least the first row of each submap is. One that does not tell exposures took pictures as they came.
 
         Raises:
             ArchiveError: if the file is damaged or of another version.
@@ -141,23 +150,7 @@ class RunDirectory:
         path = self.path / "trajectory.npz"
         if not path.exists():
             return Trajectory(), Atlas()
-        columns = archive.read_arrays(path, "trajectory")
-        unknown = np.zeros(len(columns["lost"]), np.bool_)
-        unchanged = np.tile(astuple(UNCHANGED), (len(unknown), 1))
-        rows = tuple(
-            TrackedPose(int(frame), float(stamp), int(submap), torch.from_numpy(T), bool(lost), bool(mapped), exposure)
-            for frame, stamp, submap, lost, mapped, T, exposure in zip(
-                columns["frame_index"],
-                columns["timestamp"],
-                columns["submap_index"],
-                columns["lost"],
-                columns.get("mapped", unknown),
-                columns["T_map_cam"],
-                (Exposure(*pair) for pair in columns.get("exposure", unchanged).tolist()),
-                strict=True,
-            )
-        )
-        return Trajectory(rows), Atlas(tuple(torch.from_numpy(T) for T in columns["T_world_map"]))
+        return trajectory_of(archive.read_arrays(path, "trajectory"))
 
     def write_summary(self, summary: Mapping[str, object]) -> None:
         """Say how the run went, once it has ended.
@@ -179,10 +172,6 @@ class RunDirectory:
 
     def _submap_path(self, index: int) -> Path:
         return self.path / "submaps" / f"{index:04d}.npz"
-
-
-def _stacked(poses: list[Pose]) -> archive.Array:
-    return np.array([T.detach().cpu().numpy() for T in poses], dtype=np.float64).reshape(-1, 4, 4)
 
 
 def _read_json(path: Path, complaint: str) -> dict[str, object]:

@@ -87,15 +87,32 @@ class Ablation:
 
 
 @dataclass(frozen=True)
+class Loops:
+    """Time how long it takes to compare a finished submap with those before it, by how many these are.
+
+    Every submap of the run is compared again, one after another, with nothing else going on. Times are means of the
+    last five comparisons, in milliseconds.
+    """
+
+    run: tyro.conf.Positional[Path | None] = None
+    """A run directory; if left out, a walk through two synthetic rooms is made and mapped: some two minutes."""
+    backend: str = "auto"
+    """Rasterizer: auto, numba or reference."""
+    json: Path | None = None
+    """File to write the figures to."""
+
+
+@dataclass(frozen=True)
 class Args:
-    """Time the mapping's kernels on random scenes, or the whole system on a recorded sequence; or see what it is worth
-    there that confidence guides it.
+    """Time the mapping's kernels on random scenes, the whole system on a recorded sequence, or loop closure; or see
+    what it is worth on a sequence that confidence guides the system.
     """
 
     what: tyro.conf.OmitSubcommandPrefixes[
         tyro.conf.OmitArgPrefixes[
             Annotated[Render, tyro.conf.subcommand("render")]
             | Annotated[Track, tyro.conf.subcommand("track")]
+            | Annotated[Loops, tyro.conf.subcommand("loops")]
             | Annotated[Ablation, tyro.conf.subcommand("ablation")]
         ]
     ]
@@ -114,7 +131,11 @@ def command(args: Args) -> int:
 
         return ablation.command(args.what, args.settings)
     if args.settings:
-        raise UsageError(f"bench render has no settings, but --{next(iter(args.settings))} was given; leave it out")
+        raise UsageError(f"this bench has no settings, but --{next(iter(args.settings))} was given; leave it out")
+    if isinstance(args.what, Loops):
+        from tcgsplat.cli.bench import loops
+
+        return loops.command(args.what)
     from tcgsplat.cli.bench import render
 
     return render.command(args.what)

@@ -16,6 +16,9 @@ Array = np.ndarray[Any, np.dtype[Any]]
 _BASELINE_FOCAL = 0.075 * 570.0
 """Kinect: 7.5 cm between projector and camera times a focal length of 570 pixels, metre pixels."""
 
+_EDGE = 0.02
+"""How much the surface bends within the window, of its depth, where one surface ends before another."""
+
 
 class Effect(enum.IntEnum):
     """Names the random numbers of an effect, so that switching one on changes no other."""
@@ -63,8 +66,12 @@ def noisy_depth(
         depth.astype(np.float32), u + du, v + dv, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
     ).astype(np.float64)
     reach = 2 * round(1.5 * pixel) + 1
-    nearest = cv2.erode(np.where(depth > 0, depth, 1e3), np.ones((reach, reach), np.uint8))
-    grown = np.where(_blotches(rng, (h, w), 10 * pixel + 1) > 0.15, np.minimum(shifted, nearest), shifted)
+    around = np.ones((reach, reach), np.uint8)
+    nearest, farthest = cv2.erode(np.where(depth > 0, depth, 1e3), around), cv2.dilate(depth, around)
+    # on a slope the one is as much nearer as the other is farther: it has no edge, and would only come nearer
+    edge = np.abs(farthest + nearest - 2 * depth) > _EDGE * depth
+    grows = edge & (_blotches(rng, (h, w), 10 * pixel + 1) > 0.15)
+    grown = np.where(grows, np.minimum(shifted, nearest), shifted)
     mixed = cv2.blur(grown, (reach, reach))
     z = np.where(rng.uniform(0, 1, (h, w)) < 0.25, mixed, grown)
     # Range: noise of the disparity, part of it shared by neighbours, then its quantisation.

@@ -28,8 +28,6 @@ _SHUTTER = 0.5
 class SynthConfig:
     """A walk through a furnished apartment of two rooms and back, as an RGB-D camera records it."""
 
-    place: Name = "apartment"
-    """Two different rooms with a doorway between them, or `twins`: two that look the same, and a hall between them."""
     frames: int = 600
     """Number of frames for the whole walk: with fewer, the camera moves faster."""
     width: int = 320
@@ -40,6 +38,8 @@ class SynthConfig:
     """Frames per second."""
     seed: int = 0
     """Seed of colours, books and fruits, of the hand's shaking, and of every effect below."""
+    place: Name = "apartment"
+    """Two different rooms with a doorway between them, or `twins`: two that look the same, and a hall between them."""
     layout: Literal["tum", "replica"] = "tum"
     """Files as in the TUM RGB-D benchmark, or as NICE-SLAM distributes Replica."""
     depth_noise: bool = False
