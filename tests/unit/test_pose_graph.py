@@ -212,6 +212,17 @@ def test_a_loop_that_alone_joins_two_parts_is_believed_and_a_minority_is_not() -
     assert three.rejected == (len(cut) + 1,)
 
 
+@pytest.mark.parametrize("metres", [1e-2, 1e-4, 1e-6])
+def test_an_edge_may_be_far_firmer_than_the_rest(metres: float) -> None:
+    poses, edges = chain()
+    firm = Edge(NODES - 1, 0, shift(8.5), information(metres, metres), loop=True)
+    weak = [Edge(edge.source, edge.target, edge.T_target_source, information(1.0, 1.0), loop=False) for edge in edges]
+    for odometry in (weak, [edge for edge in edges if edge.target != 4]):
+        solution = solved(poses, [*odometry, firm])
+        assert solution.rejected == ()
+        torch.testing.assert_close(solution.T_world_map[-1], shift(8.5), atol=1e-4, rtol=0)
+
+
 def test_poses_that_are_the_best_already_keep_their_bits() -> None:
     poses, edges = random_graph(2, nodes=20, loops=15, false=3)
     once = solved(poses, edges)

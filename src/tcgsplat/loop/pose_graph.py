@@ -4,7 +4,7 @@ What is minimised is truncated least squares: the chi2 of the odometry, plus tha
 cheaper, the price of not believing it, the chi2 that one right edge in a hundred exceeds. So n edges that agree are
 believed against a drift of up to 4.1 sqrt(n) standard deviations of the odometry between their ends, and not beyond.
 
-gtsam finds the poses (Levenberg-Marquardt); which edges to believe is a search over sets of them, from what the odometry
+gtsam finds the poses (Levenberg-Marquardt); which edges to believe is a search over sets of them, from what odometry
 alone leads to expect. gtsam's graduated non-convexity lowers the same sum by weights and does not ask at the end what
 belief in an edge costs: in 60 random graphs with 30 loop edges it believed 25 of the 801 false ones, and this search 2.
 With four or eight loop edges the two are alike. See `solved` for what is asked of the odometry.
@@ -28,7 +28,8 @@ from tcgsplat.tensors import Pose
 _ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 """gtsam's order of a tangent, in places of ours."""
 _ANCHOR = 1e-3
-"""Standard deviation, metres and radians, of what is held; any does, as nothing pulls at the whole."""
+"""Standard deviation, metres and radians, of what is held. Nothing pulls at the whole, but gtsam takes a far weaker one
+for none."""
 _LEASH = 100.0
 """Standard deviation, metres and radians, of where a part of the map stands that nothing but loop edges joins."""
 _STEPS = 100
@@ -192,7 +193,6 @@ class _Graph:
         """Least squares over what is believed. Raises RuntimeError if it does not converge."""
         graph = self.factors(believed)
         settings = gtsam.LevenbergMarquardtParams()
-        settings.setLinearSolverType("MULTIFRONTAL_QR")  # its Cholesky gives up where some edges are far firmer
         settings.setMaxIterations(_STEPS)
         settings.setRelativeErrorTol(1e-12)
         settings.setAbsoluteErrorTol(0.1 * _SAME)
