@@ -119,13 +119,59 @@ def test_eval_then_export(run: RunDirectory, capsys: pytest.CaptureFixture[str])
         assert picture is not None and picture.std() > 10
 
     assert main(["export", str(run.path)]) == 0
+    assert "merged now" in capsys.readouterr().out
     gaussians, confidence = read_gaussians(run.path / "map.ply")
-    assert len(gaussians) == run.summary()["gaussians"]
+    assert len(gaussians) == report["gaussians_map"]["value"] < 0.7 * run.summary()["gaussians"]
     assert confidence is not None and 0 < confidence.min() < confidence.max() <= 1
     submap = run.load_submap(2)
-    world = submap.T_world_map[:3, :3].float() @ submap.gaussians.means[-1] + submap.T_world_map[:3, 3].float()
-    torch.testing.assert_close(gaussians.means[-1], world, atol=1e-5, rtol=0)
-    torch.testing.assert_close(confidence[-1], submap.confidence.value[-1])
+    world = submap.gaussians.means @ submap.T_world_map[:3, :3].T.float() + submap.T_world_map[:3, 3].float()
+    apart, row = torch.cdist(gaussians.means[-1:], world).min(dim=1)
+    assert apart.item() < 1e-5
+    torch.testing.assert_close(confidence[-1:], submap.confidence.value[row])
+
+
+def test_refine_then_eval_and_export(run: RunDirectory, capsys: pytest.CaptureFixture[str]):
+    def map_row(name: str) -> float:
+        assert main(["eval", str(run.path)]) == 0
+        return json.loads((run.path / "report.json").read_text())[name]["value"]
+
+    submaps = [(run.path / "submaps" / f"{index:04d}.npz").read_bytes() for index in range(3)]
+    before = map_row("psnr_map_withheld")
+    capsys.readouterr()
+    assert main(["refine", str(run.path), "--steps", "20"]) == 0
+    said = capsys.readouterr()
+    merged, refined = said.out.splitlines()
+    assert merged.startswith("3 submaps merged: ") and said.err == ""
+    assert refined.endswith(f" Gaussians refined by 120 steps over 6 keyframes: {run.path / 'map.npz'}")
+    assert submaps == [(run.path / "submaps" / f"{index:04d}.npz").read_bytes() for index in range(3)]
+    assert map_row("psnr_map_withheld") > before + 0.3
+    first = (run.path / "map.npz").read_bytes()
+
+    capsys.readouterr()
+    assert main(["export", str(run.path), "--ply"]) == 0
+    assert "refined by 120 steps" in capsys.readouterr().out
+    whole = run.load_map()
+    assert whole is not None
+    assert torch.equal(read_gaussians(run.path / "map.ply")[0].means, whole.submap.gaussians.means)
+
+    assert main(["refine", str(run.path), "--steps", "20"]) == 0
+    assert (run.path / "map.npz").read_bytes() == first
+
+
+def test_ctrl_c_keeps_what_is_refined_so_far(run: RunDirectory):
+    process = subprocess.Popen(
+        line("refine", run.path, "--seconds", str(PATIENCE)), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("3 submaps merged")
+    time.sleep(1.0)
+    process.send_signal(signal.SIGINT)
+    said, complaints = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    assert complaints == "tcgsplat: stopping; Ctrl-C again to leave the run as it was\n"
+    assert said.endswith(f"{run.path / 'map.npz'}\n")
+    whole = run.load_map()
+    assert whole is not None and whole.steps > 0
 
 
 def test_export_writes_only_what_was_asked_for(run: RunDirectory, tmp_path: Path):

@@ -26,6 +26,7 @@ from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory, format_tum
 from tcgsplat.storage.run_directory import RunDirectory
+from tcgsplat.storage.world_map import world_map
 from tcgsplat.tensors import Image, Pose
 
 CAMERA = Camera(fx=40.0, fy=40.0, cx=23.5, cy=15.5, width=48, height=32)
@@ -180,6 +181,9 @@ def test_figures_of_a_run(run: RunDirectory, sequence: Recorded, rasterizer: Ras
     assert 0.3 < value["ssim_withheld"] < 0.99
     assert value["depth_l1_withheld"] == pytest.approx(100 * OFFSET, abs=0.02)
     assert value["coverage_withheld"] == 100.0
+    assert value["coverage_map_withheld"] == 100.0
+    assert 10.0 < value["psnr_map_withheld"] < 20.0  # the two walls are painted differently, and one of them is kept
+    assert value["depth_l1_map_withheld"] == pytest.approx(100 * OFFSET, abs=0.1)
     assert value["depth_coverage"] == pytest.approx(100.0)
     assert (value["frames"], value["frames_lost"], value["submaps"]) == (8, 1, 2)
     assert value["gaussians"] == 2 * len(wall(0, at(0.0)))
@@ -188,15 +192,49 @@ def test_figures_of_a_run(run: RunDirectory, sequence: Recorded, rasterizer: Ras
     assert unit == {
         "ate_rmse": "cm", "psnr_withheld": "dB", "ssim_withheld": "", "depth_l1_withheld": "cm",
         "psnr_withheld_unexposed": "dB", "psnr_withheld_mapped": "dB", "coverage_withheld": "%",
+        "psnr_map_withheld": "dB", "ssim_map_withheld": "", "depth_l1_map_withheld": "cm", "coverage_map_withheld": "%",
         "psnr": "dB", "ssim": "", "depth_l1": "cm", "depth_coverage": "%", "frames": "",
-        "frames_lost": "", "submaps": "", "gaussians": "", "ms_per_frame": "ms", "peak_rss_mb": "MB",
+        "frames_lost": "", "submaps": "", "gaussians": "", "gaussians_map": "",
+        "ms_per_frame": "ms", "peak_rss_mb": "MB",
     }  # fmt: skip
-    assert list(unit)[:8] == ["ate_rmse", *(name for name in unit if "withheld" in name), "psnr"]
+    assert list(unit)[:12] == ["ate_rmse", *(name for name in unit if "withheld" in name), "psnr"]
     assert report.evaluated["poses"] == "estimated, and so are exposures (psnr_withheld_unexposed: one for a submap)"
     assert "training views" in report.evaluated["views"]
     assert report.evaluated["withheld"].startswith("3 of 3 frames")
     assert report.evaluated["withheld"].endswith("spread evenly")
     assert report.evaluated["trajectory"].startswith("7 of 8 frames")
+
+
+def test_withheld_views_are_drawn_from_the_one_map_too(
+    run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer
+) -> None:
+    """At the poses and with the exposures that they have in it."""
+    submaps = [run.load_submap(index) for index in range(2)]
+    darker, moved = Exposure(0.8, 0.05), submaps[0].gaussians.transformed(at(-0.4))
+    sh = (darker.removed(0.28209479177387814 * moved.sh + 0.5) - 0.5) / 0.28209479177387814
+    keyframes = tuple(replace(keyframe, exposure=darker) for keyframe in submaps[1].keyframes)
+    gaussians = replace(moved, ids=moved.ids + 1000, sh=sh)  # the same wall, such that it looks so in darker pictures
+    surer = replace(submaps[0].confidence, value=2 * submaps[0].confidence.value)
+    run.write_submap(replace(submaps[1], gaussians=gaussians, confidence=surer, keyframes=keyframes))
+    trajectory, atlas = run.trajectory()
+    rows = tuple(replace(row, exposure=darker) if row.submap_index else row for row in trajectory.rows)
+    run.write_trajectory(Trajectory(rows), atlas)
+    frames = [
+        replace(frame, color=row.exposure.applied(drawn_at(run, row, rasterizer)).clamp(0, 1))
+        for row, frame in zip(rows, sequence.frames, strict=True)
+    ]
+    report = evaluate(run, replace(sequence, frames=tuple(frames)), rasterizer)
+    value = {name: metric.value for name, metric in report.metrics.items()}
+    assert value["psnr_withheld"] > 90.0 and value["psnr_map_withheld"] > 35.0
+    assert value["gaussians_map"] == len(submaps[0])
+    assert report.evaluated["map"].endswith("not refined")
+
+    whole = world_map(run, rasterizer)
+    black = replace(whole.submap.gaussians, sh=torch.full_like(whole.submap.gaussians.sh, -2.0))
+    run.write_map(replace(whole, submap=replace(whole.submap, gaussians=black), steps=3))
+    report = evaluate(run, replace(sequence, frames=tuple(frames)), rasterizer)
+    assert report.metrics["psnr_map_withheld"].value < 12.0 and report.metrics["psnr_withheld"].value > 90.0
+    assert report.evaluated["map"] == "refined by 3 steps"
 
 
 def drawn_at(run: RunDirectory, row: TrackedPose, rasterizer: Rasterizer) -> Image:
@@ -378,7 +416,7 @@ def test_killed_run_without_data_is_still_scored(run: RunDirectory, rasterizer: 
     assert report.metrics["psnr"].value > 50.0
     withheld = {name for name in report.missing if "withheld" in name}
     assert report.missing.keys() == {"ate_rmse", "ms_per_frame", "peak_rss_mb"} | withheld
-    assert len(withheld) == 6
+    assert len(withheld) == 10
     assert report.missing["psnr_withheld"] == "the sequence is not at hand"
     assert report.evaluated["withheld"].startswith("0 of 2 frames")
     assert report.missing["ate_rmse"] == "no ground truth"

@@ -37,10 +37,10 @@ def command(args: Args) -> int:
     from tcgsplat.cli.recorder import Part, begin, recorded
     from tcgsplat.cli.scoring import scored
     from tcgsplat.cli.settings import resolved
-    from tcgsplat.cli.world_map import world_map
     from tcgsplat.datasets.synthetic import SynthConfig, synthesize
     from tcgsplat.render.backends import open_rasterizer
     from tcgsplat.storage.ply import write_gaussians
+    from tcgsplat.storage.world_map import world_map
 
     config = resolved(args.preset, None, args.settings, None)
     rasterizer = open_rasterizer()
@@ -56,7 +56,8 @@ def command(args: Args) -> int:
         sys.stderr.write(f"tcgsplat: stopped; saved {summary}: {run.path}\n")
         return 130
     report = scored(run, sequence, rasterizer)
-    write_gaussians(run.path / "map.ply", *world_map(run))
+    whole = world_map(run, rasterizer).submap
+    write_gaussians(run.path / "map.ply", whole.gaussians, whole.confidence.value)
     cost = f"{summary}; kernels compiled in {summary.seconds_compiling:.1f} s before"
     sys.stdout.write(_told(run.path, report.metrics, cost))
     return 0

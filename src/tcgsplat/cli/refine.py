@@ -1,7 +1,11 @@
-"""`tcgsplat refine`: optimise the map of a finished run further."""
+"""`tcgsplat refine`: all submaps of a run as one map, optimised over all keyframes."""
 
+import signal
 import sys
-from dataclasses import dataclass
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tyro
@@ -9,17 +13,18 @@ import tyro
 
 @dataclass(frozen=True)
 class Args:
-    """Optimise a run's map further over its keyframes, which hold their pictures: the recording is not needed.
+    """Merge a run's submaps into one map, and optimise it over the keyframes of all of them.
 
-    Poses and confidence stay; the map gets sharper. Every submap's file is replaced by the refined one when that is
-    complete, so that Ctrl-C leaves a whole run. Every submap gets the same share of the time. How far --seconds
-    gets depends on the machine; --steps gives the same bits every time. Score and export the run again afterwards.
+    The keyframes hold their pictures: the recording is not needed. Poses and confidence stay; the map gets sharper. It
+    is written to map.npz in the run directory, which `eval` scores and `export` writes; the submaps stay as they are.
+    How far --seconds gets depends on the machine; --steps gives the same bits every time. Ctrl-C ends it early and
+    keeps what is refined so far; a second one leaves the run as it was.
     """
 
     run: tyro.conf.Positional[Path]
-    """The run directory; its submaps are replaced."""
+    """The run directory."""
     seconds: float = 60.0
-    """Of optimising, for all submaps together; reading and writing their files comes on top."""
+    """Of optimising; merging, which takes some seconds, comes on top."""
     steps: int | None = None
     """So many optimisation steps a keyframe, instead of a time."""
     backend: str = "auto"
@@ -27,7 +32,7 @@ class Args:
 
 
 def command(args: Args) -> int:
-    """Refine submap by submap, and say so."""
+    """Merge, refine, write, and say so."""
     import torch
 
     from tcgsplat.cli.kernels import compile_kernels
@@ -37,6 +42,7 @@ def command(args: Args) -> int:
     from tcgsplat.mapping.refinement import for_seconds, for_steps, refined
     from tcgsplat.render.backends import open_rasterizer
     from tcgsplat.storage.run_directory import RunDirectory
+    from tcgsplat.storage.world_map import newly_merged
 
     if not args.seconds > 0 or (args.steps is not None and args.steps < 1):
         raise UsageError("--seconds must be above 0, and --steps at least 1")
@@ -45,14 +51,50 @@ def command(args: Args) -> int:
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     torch.set_num_threads(1)  # as in a run: the kernels have threads of their own
     compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
-    generator, submaps = torch.Generator().manual_seed(config.seed), run.submap_count
-    with counting("submap") as tell:
-        for index in range(submaps):
-            tell(index, submaps)
-            submap = run.load_submap(index)
-            steps = None if args.steps is None else args.steps * len(submap.keyframes)
-            progress = for_seconds(args.seconds / submaps) if steps is None else for_steps(steps)
-            run.write_submap(refined(submap, config.mapper, config.confidence, rasterizer, generator, progress))
-    effort = f"{args.seconds:g} s" if args.steps is None else f"{args.steps} steps a keyframe"
-    sys.stdout.write(f"{submaps} submaps refined by {effort}: {run.path}\n")
-    return 0
+    merged = newly_merged(run, rasterizer)
+    sys.stdout.write(f"{len(merged.T_world_map)} submaps merged: {len(merged.submap)} Gaussians\n")
+    sys.stdout.flush()
+    keyframes = len(merged.submap.keyframes)
+    done = for_seconds(args.seconds) if args.steps is None else for_steps(args.steps * keyframes)
+    with counting("refined, %:") as tell, _stopping_on_interrupt() as stop:
+        effort = _Effort(done, stop.is_set, tell)
+        generator = torch.Generator().manual_seed(config.seed)
+        submap = refined(merged.submap, config.mapper, config.confidence, rasterizer, generator, effort)
+    run.write_map(replace(merged, submap=submap, steps=effort.steps))
+    sys.stdout.write(
+        f"{len(submap)} Gaussians refined by {effort.steps} steps over {keyframes} keyframes: {run.path / 'map.npz'}\n"
+    )
+    return 130 if stop.is_set() else 0
+
+
+class _Effort:
+    """Progress of `refined` that can be stopped, is shown in percent, and counts the steps."""
+
+    def __init__(
+        self, done: Callable[[int], float], stopped: Callable[[], bool], tell: Callable[[int, int], None]
+    ) -> None:
+        self._done, self._stopped, self._tell = done, stopped, tell
+        self.steps = 0
+
+    def __call__(self, steps: int) -> float:
+        self.steps = steps
+        share = 1.0 if self._stopped() else self._done(steps)
+        self._tell(min(round(100 * share), 100), 100)
+        return share
+
+
+@contextmanager
+def _stopping_on_interrupt() -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets; the second one is as ever."""
+    stop = threading.Event()
+
+    def first(*_: object) -> None:
+        stop.set()
+        signal.signal(signal.SIGINT, previous)
+        sys.stderr.write("tcgsplat: stopping; Ctrl-C again to leave the run as it was\n")
+
+    previous = signal.signal(signal.SIGINT, first)
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -17,6 +17,7 @@ from tcgsplat.evaluation.views import (
     MOST_WITHHELD,
     ViewScore,
     in_turn,
+    in_world,
     learnt_delay,
     spread,
     training_views,
@@ -24,13 +25,15 @@ from tcgsplat.evaluation.views import (
     withheld_rows,
     withheld_views,
 )
+from tcgsplat.mapping.merging import Merged
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.render.view import MIN_COVERAGE, render_view
+from tcgsplat.render.view import MIN_COVERAGE, SubmapView, render_view
 from tcgsplat.scene import exposure
 from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory, parse_tum
 from tcgsplat.storage import atomic
 from tcgsplat.storage.run_directory import RunDirectory
+from tcgsplat.storage.world_map import world_map
 from tcgsplat.tensors import Pose
 
 _WITHHELD = (
@@ -40,6 +43,12 @@ _WITHHELD = (
     ("depth_l1_withheld", "depth_l1", "cm"),
     ("psnr_withheld_mapped", "psnr_mapped", "dB"),
     ("coverage_withheld", "coverage", "%"),
+)
+_MAP = (
+    ("psnr_map_withheld", "psnr", "dB"),
+    ("ssim_map_withheld", "ssim", ""),
+    ("depth_l1_map_withheld", "depth_l1", "cm"),
+    ("coverage_map_withheld", "coverage", "%"),
 )
 _TRAINING = (
     ("psnr", "psnr", "dB"),
@@ -109,8 +118,9 @@ def evaluate(
     """Score a run, finished or not, by its own files and the frames and ground truth of its sequence.
 
     Every view is drawn from the submap that it was tracked in, as saved, at its estimated pose, and compared with the
-    camera's image over its valid pixels, so that the border that undistortion leaves empty is not counted. Figures are
-    means over the views.
+    camera's image over its valid pixels, so that the border that undistortion leaves empty is not counted. Withheld
+    ones are drawn from the one map of all submaps as well: the one that `refine` left, or as the submaps merge now.
+    Figures are means over the views.
 
     - `ate_rmse`, cm: camera centres of all tracked frames that have a true pose, after rigid alignment.
     - `psnr_withheld` (dB), `ssim_withheld`, `depth_l1_withheld` (cm): frames of the sequence that were tracked and
@@ -119,8 +129,11 @@ def evaluate(
       to compare with systems that have no exposures.
     - `psnr_withheld_mapped` (dB), `coverage_withheld` (%): the PSNR of those of their valid pixels that the map covers
       by more than half, and the share of these: the rest is what holes cost.
+    - `psnr_map_withheld` (dB), `ssim_map_withheld`, `depth_l1_map_withheld` (cm), `coverage_map_withheld` (%): the same
+      frames in the one map.
     - `psnr` (dB), `ssim`, `depth_l1` (cm), `depth_coverage` (%): the keyframes, which the map was optimised on.
-    - `frames`, `frames_lost`, `submaps`, `gaussians`, and from the run's summary `ms_per_frame` and `peak_rss_mb`.
+    - `frames`, `frames_lost`, `submaps`, `gaussians` (of all submaps), `gaussians_map` (of the one map), and from the
+      run's summary `ms_per_frame` and `peak_rss_mb`.
     - Of a run in real time, from its summary: `frames_dropped`, and `ms_late`, the median from a frame's capture to its
       pose.
 
@@ -144,6 +157,7 @@ def evaluate(
     if run.submap_count == 0 or len(trajectory) == 0:
         raise EvaluationError(f"{run.path} has no sealed submap yet; let the run go on for longer, or run again")
     truth = sequence.ground_truth() if sequence is not None else {}
+    whole = world_map(run, rasterizer)
     scored = sum(row.frame_index in truth for row in trajectory.rows)
     withheld = withheld_rows(run, trajectory)
     drawn = spread(withheld, math.ceil(len(withheld) / withheld_every) if withheld_every else MOST_WITHHELD)
@@ -155,7 +169,7 @@ def evaluate(
 
     rows = {
         "ate_rmse": _accuracy(trajectory, atlas, truth),
-        **_quality(run, sequence, rasterizer, stride, drawn, drawn_frame),
+        **_quality(run, whole, sequence, rasterizer, stride, drawn, drawn_frame),
         "frames": Metric(len(trajectory)),
         "frames_lost": Metric(sum(row.lost for row in trajectory.rows)),
         **_cost(run.summary()),
@@ -169,6 +183,7 @@ def evaluate(
             "withheld": _told_withheld(trajectory, len(withheld), len(drawn) if sequence is not None else 0),
             "views": f"{'all keyframes' if stride == 1 else f'one keyframe in {stride}'} of the saved submaps: "
             "training views; these and the withheld ones are each drawn from their own submap",
+            "map": f"refined by {whole.steps} steps" if whole.steps else "the submaps as they merge now, not refined",
             "poses": "estimated, and so are exposures (psnr_withheld_unexposed: one for a submap)",
             "pixels": "psnr and ssim: valid pixels, without the border that undistortion leaves empty; "
             f"psnr_withheld_mapped: those with alpha above {MIN_COVERAGE:g}; "
@@ -258,6 +273,7 @@ def _accuracy(trajectory: Trajectory, atlas: Atlas, truth: Mapping[int, Pose]) -
 
 def _quality(
     run: RunDirectory,
+    whole: Merged,
     sequence: Sequence | None,
     rasterizer: Rasterizer,
     stride: int,
@@ -266,6 +282,8 @@ def _quality(
 ) -> dict[str, Metric | str]:
     """Submaps are read one after the other, so that memory holds one of them; `drawn` hears of every frame index."""
     scores: dict[bool, list[ViewScore]] = {True: [], False: []}
+    in_map: list[ViewScore] = []
+    map_view = SubmapView(whole.submap, rasterizer)
     velocities = velocities_by_frame(*run.trajectory())
     gaussians = seen = 0
     delay = learnt_delay(run)
@@ -277,15 +295,21 @@ def _quality(
         for view in in_turn(training_views(submap, slice(-seen % stride, None, stride)), unseen):
             rendering = render_view(submap, view.frame.camera, view.T_map_cam, rasterizer)
             scores[view.withheld].append(ViewScore.of(rendering, view, middle))
+            if view.withheld:
+                placed = in_world(view, index, whole)
+                rendering = map_view(placed.frame.camera, placed.T_map_cam)
+                in_map.append(ViewScore.of(rendering, placed, middle))
             drawn(view.frame.index)
         gaussians += len(submap)
         seen += len(submap.keyframes)
     none_left = "every frame of the saved submaps was mapped or lost"
     return {
         **_means(scores[True], _WITHHELD, "the sequence is not at hand" if sequence is None else none_left),
+        **_means(in_map, _MAP, "the sequence is not at hand" if sequence is None else none_left),
         **_means(scores[False], _TRAINING, "the saved submaps have no keyframe"),
         "submaps": Metric(run.submap_count),
         "gaussians": Metric(gaussians),
+        "gaussians_map": Metric(len(whole.submap)),
     }
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from tcgsplat.datasets.sequence import Sequence
 from tcgsplat.evaluation import images
+from tcgsplat.mapping.merging import Merged
 from tcgsplat.render.view import MIN_COVERAGE, Rendering
 from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.exposure import Exposure
@@ -127,6 +128,12 @@ def withheld_views(
         frame = sequence.frame(row.frame_index).with_depth_later(delay)
         frame = synchronized(frame, velocities[row.frame_index])
         yield PosedFrame(frame, row.T_map_cam, row.exposure, withheld=True)
+
+
+def in_world(view: PosedFrame, submap: int, whole: Merged) -> PosedFrame:
+    """A view of one of the submaps as a view of the one map."""
+    T_world_cam, exposure = whole.posed(submap, view.T_map_cam), whole.exposed(submap, view.exposure)
+    return PosedFrame(view.frame, T_world_cam, exposure, view.withheld)
 
 
 def velocities_by_frame(trajectory: Trajectory, atlas: Atlas) -> dict[int, Float[Tensor, "6"]]:

@@ -33,13 +33,16 @@ from tcgsplat.tensors import PerGaussian, PerGaussianFlag
 _FAINT = -60.0
 """Logit of an opacity that no rasterizer draws."""
 _LANES: Floats = np.arange(16, dtype=np.float32)
+_MOST_HELD = 1 << 30
+"""Bytes of keyframes held ready; beyond that they are made ready each time, so that memory does not grow with a run."""
 
 
 def covers(submap: Submap, config: MapperConfig, confidence: ConfidenceConfig) -> bool:
     """Whether the kernels know what these settings and pictures ask for."""
     literal = confidence.guide_mapping and confidence.step_scale_mode == "gradient"
     plain = config.sh_degree == 0 and config.isotropy_weight == 0 and config.frozen_color_share == 0
-    wide = all(keyframe.frame.camera.width >= loss_kernels.MIN_WIDTH for keyframe in submap.keyframes)
+    cameras = [keyframe.frame.camera for keyframe in submap.keyframes[:1]]  # a run has one camera
+    wide = all(camera.width >= loss_kernels.MIN_WIDTH for camera in cameras)
     return plain and wide and not literal
 
 
@@ -54,6 +57,11 @@ class _View:
         self.valid: Floats = frame.valid.numpy().astype(np.float32)
         self.depth: Floats = frame.depth.numpy() * self.valid
         self.measured = max(int((self.depth > 0).sum()), 1)
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return self.color.nbytes + self.valid.nbytes + self.depth.nbytes
 
 
 class NativeOptimization:
@@ -129,9 +137,12 @@ class NativeOptimization:
         return self._raw[:, kernels.LOGIT].reshape(-1)[: len(self._submap)] > _FAINT
 
     def _view(self, index: int) -> _View:
-        if index not in self._views:
-            self._views[index] = _View(self._submap.keyframes[index])
-        return self._views[index]
+        if index in self._views:
+            return self._views[index]
+        view = _View(self._submap.keyframes[index])
+        if (len(self._views) + 1) * view.size <= _MOST_HELD:
+            self._views[index] = view
+        return view
 
     def _differentiated_losses(self, view: _View, planes: Floats) -> Floats:
         """The derivative of Eq. 21 by the images; keeps its value."""

@@ -72,16 +72,13 @@ class AutogradOptimization:
         self._config, self._confidence, self._rasterizer = config, confidence, rasterizer
         self._submap, self._before = submap, submap.gaussians
         self._adam = RowAdam(submap.gaussians, config.rates)
-        self._frames = [keyframe.balanced for keyframe in submap.keyframes]
-        self._T_cam_map = [se3.inverse(keyframe.T_map_cam) for keyframe in submap.keyframes]
         self._loss_value = torch.zeros(())
 
     def step(self, view: int, frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
         """See `Optimization`."""
-        frame, gaussians = self._frames[view], self._adam.gaussians
-        rendering = render(
-            gaussians, self._submap.confidence.value, frame.camera, self._T_cam_map[view], self._rasterizer
-        )
+        keyframe, gaussians = self._submap.keyframes[view], self._adam.gaussians
+        frame, T_cam_map = keyframe.balanced, se3.inverse(keyframe.T_map_cam)
+        rendering = render(gaussians, self._submap.confidence.value, frame.camera, T_cam_map, self._rasterizer)
         loss = self._loss(rendering, frame, gaussians, self._before, self._submap)
         scale, literal = self._step_scale(self._submap), self._confidence.step_scale_mode == "gradient"
         self._adam.step(

@@ -1,4 +1,4 @@
-"""Making a finished submap prettier: the losses of mapping, over all of its keyframes, for as long as one likes."""
+"""Making a finished map prettier: the losses of mapping, over all of its keyframes, for as long as one likes."""
 
 import time
 from collections.abc import Callable
@@ -25,13 +25,13 @@ def refined(
     generator: torch.Generator,
     progress: Callable[[int], float],
 ) -> Submap:
-    """A submap optimised further over its keyframes, each seen once before any is seen again.
+    """A submap, or all of them merged, optimised further over the keyframes, each seen once before any is seen again.
 
     Confidence weighs pixels and steps as it does online (equations 20 and 24) and stays what it was. The stability loss
     is left out: it holds a Gaussian to where it was before one mapping update, and this is no such update.
 
     Args:
-        submap: With its keyframes.
+        submap: With its keyframes, of which not all need fit into memory.
         config: Losses and learning rates.
         confidence: Guidance.
         rasterizer: Backend.

@@ -3,6 +3,7 @@
 Loop closure moves one pose, `T_world_map`; everything inside stays in the map frame, so nothing in it is rewritten.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -39,7 +40,8 @@ class Submap:
     """Where the map frame stands in the world: the pose of the first camera of the submap."""
     gaussians: Gaussians
     confidence: ConfidenceState
-    keyframes: tuple[Keyframe, ...] = ()
+    keyframes: Sequence[Keyframe] = ()
+    """In the order of time; perhaps read from disk when asked for."""
     clock: int = 0
     """Mapping updates so far: the paper's t, the time that confidence lives in."""
 

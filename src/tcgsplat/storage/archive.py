@@ -11,9 +11,11 @@ Gaussians, confidence and poses come back bit by bit. Keyframe images are PNG in
 
 import zipfile
 import zlib
-from collections.abc import Collection, Mapping
-from dataclasses import astuple, fields
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import astuple, fields, replace
 from pathlib import Path
+from typing import overload
 
 import cv2
 import numpy as np
@@ -36,6 +38,17 @@ VERSION = 1
 """Of every archive's layout; a reader refuses any other."""
 DEPTH_UNITS_PER_METRE = 5000.0
 _DEPTH_UNITS_MAX = 65535
+
+_COLUMNS = (
+    *("index", "clock", "T_world_map", "keyframes"),
+    *(f"gaussians.{f.name}" for f in fields(Gaussians)),
+    *(f"confidence.{f.name}" for f in fields(ConfidenceState)),
+)
+"""Of a submap's file without its keyframes."""
+_KEYFRAME_COLUMNS = (
+    *("frame_index", "timestamp", "camera", "T_map_cam", "exposure"),
+    *("color", "depth", "depth_units_per_metre", "valid"),
+)
 
 Array = Shaped[np.ndarray, "..."]
 Png = UInt8[np.ndarray, " bytes"]
@@ -74,14 +87,7 @@ def read_arrays(path: Path, kind: str, names: Collection[str] | None = None) -> 
 
 def write_submap(path: Path, submap: Submap) -> None:
     """Write a submap with everything in it to `path`."""
-    arrays = {
-        "index": np.array(submap.index),
-        "clock": np.array(submap.clock),
-        "T_world_map": _array(submap.T_world_map),
-        **{f"gaussians.{f.name}": _array(getattr(submap.gaussians, f.name)) for f in fields(Gaussians)},
-        **{f"confidence.{f.name}": _array(getattr(submap.confidence, f.name)) for f in fields(ConfidenceState)},
-        "keyframes": np.array(len(submap.keyframes)),
-    }
+    arrays = {**pack_submap(submap), "keyframes": np.array(len(submap.keyframes))}
     for i, keyframe in enumerate(submap.keyframes):
         arrays |= {f"keyframe.{i}.{name}": array for name, array in _pack_keyframe(keyframe).items()}
     write_arrays(path, "submap", arrays)
@@ -94,7 +100,65 @@ def read_submap(path: Path) -> Submap:
         ArchiveError: if the file is missing, truncated, damaged, of another kind or of another version.
     """
     arrays = read_arrays(path, "submap")
-    try:
+    submap = unpack_submap(path, arrays)
+    with _complete(path):
+        keyframes = tuple(_unpack_keyframe(arrays, f"keyframe.{i}.") for i in range(int(arrays["keyframes"])))
+    return replace(submap, keyframes=keyframes)
+
+
+def open_submap(path: Path) -> Submap:
+    """Read a submap back without its keyframes: each is read when it is asked for.
+
+    Raises:
+        ArchiveError: as `read_submap`; also when a keyframe is asked for.
+    """
+    arrays = read_arrays(path, "submap", _COLUMNS)
+    submap = unpack_submap(path, arrays)
+    with _complete(path):
+        return replace(submap, keyframes=StoredKeyframes(path, int(arrays["keyframes"])))
+
+
+class StoredKeyframes(Sequence[Keyframe]):
+    """The keyframes in a submap's file. Reading one takes a few milliseconds; none is kept in memory."""
+
+    def __init__(self, path: Path, count: int) -> None:
+        self._path, self._count = path, count
+
+    def __len__(self) -> int:
+        return self._count
+
+    @overload
+    def __getitem__(self, place: int) -> Keyframe: ...
+    @overload
+    def __getitem__(self, place: slice) -> tuple[Keyframe, ...]: ...
+    def __getitem__(self, place: int | slice) -> Keyframe | tuple[Keyframe, ...]:
+        """Read a keyframe, or several."""
+        if isinstance(place, slice):
+            return tuple(self[i] for i in range(*place.indices(len(self))))
+        prefix = f"keyframe.{range(len(self))[place]}."
+        arrays = read_arrays(self._path, "submap", [f"{prefix}{name}" for name in _KEYFRAME_COLUMNS])
+        with _complete(self._path):
+            return _unpack_keyframe(arrays, prefix)
+
+
+def pack_submap(submap: Submap) -> dict[str, Array]:
+    """Everything in a submap but its keyframes, by name."""
+    return {
+        "index": np.array(submap.index),
+        "clock": np.array(submap.clock),
+        "T_world_map": _array(submap.T_world_map),
+        **{f"gaussians.{f.name}": _array(getattr(submap.gaussians, f.name)) for f in fields(Gaussians)},
+        **{f"confidence.{f.name}": _array(getattr(submap.confidence, f.name)) for f in fields(ConfidenceState)},
+    }
+
+
+def unpack_submap(path: Path, arrays: Mapping[str, Array]) -> Submap:
+    """The submap that `pack_submap` packed, without keyframes.
+
+    Raises:
+        ArchiveError: if an array is missing; `path` is where they come from.
+    """
+    with _complete(path):
         return Submap(
             index=int(arrays["index"]),
             T_world_map=torch.from_numpy(arrays["T_world_map"]),
@@ -102,11 +166,8 @@ def read_submap(path: Path) -> Submap:
             confidence=ConfidenceState(
                 **{f.name: torch.from_numpy(arrays[f"confidence.{f.name}"]) for f in fields(ConfidenceState)}
             ),
-            keyframes=tuple(_unpack_keyframe(arrays, f"keyframe.{i}.") for i in range(int(arrays["keyframes"]))),
             clock=int(arrays["clock"]),
         )
-    except KeyError as error:
-        raise ArchiveError(f"{path} lacks the entry {error}; delete it and run again") from error
 
 
 def submap_size(path: Path) -> int:
@@ -116,6 +177,14 @@ def submap_size(path: Path) -> int:
         ArchiveError: as `read_submap`.
     """
     return len(read_arrays(path, "submap", ("gaussians.ids",))["gaussians.ids"])
+
+
+@contextmanager
+def _complete(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except KeyError as error:
+        raise ArchiveError(f"{path} lacks the entry {error}; delete it and run again") from error
 
 
 def _array(tensor: Tensor) -> Array:

@@ -7,20 +7,26 @@
       checkpoint.npz     what `run --resume` goes on from: the state after the last of these submaps
       trajectory.npz     exact: pose of every frame in its submap, and pose of every submap in the world
       trajectory.txt     the same composed: camera to world, TUM format
+      map.npz            written by `refine`: all submaps as one map, without pictures (those are in the submaps)
       summary.json       at the end only: frames, seconds, peak_rss_mb, stage_ms, ...
       report.json, contact_sheet.png, trajectory.png    written by the evaluation
 
-Every file is complete or absent. A submap's file is written before the trajectory that speaks of it, and again by
-`refine` only: loop closure moves submaps by `trajectory.npz` alone.
+Every file is complete or absent. A submap's file is written before the trajectory that speaks of it: loop closure
+moves submaps by `trajectory.npz` alone, and `refine` leaves them as they are.
 """
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
+import numpy as np
+import torch
+
 from tcgsplat.errors import ArchiveError
+from tcgsplat.mapping.merging import Merged, WorldKeyframes
 from tcgsplat.scene.atlas import Atlas
+from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.submap import Submap
 from tcgsplat.scene.trajectory import Trajectory, format_tum
 from tcgsplat.storage import archive, atomic
@@ -131,9 +137,46 @@ class RunDirectory:
         Raises:
             ArchiveError: if its file is missing, damaged, or of another version.
         """
-        submap = archive.read_submap(self._submap_path(index))
+        return _standing(archive.read_submap(self._submap_path(index)), self.trajectory()[1])
+
+    def open_submaps(self) -> tuple[Submap, ...]:
+        """All sealed submaps, standing where the last written trajectory has them; keyframes are read when asked for.
+
+        Raises:
+            ArchiveError: as `load_submap`; also when a keyframe is asked for.
+        """
         _, atlas = self.trajectory()
-        return replace(submap, T_world_map=atlas.T_world_map[index]) if index < len(atlas) else submap
+        paths = (self._submap_path(index) for index in range(self.submap_count))
+        return tuple(_standing(archive.open_submap(path), atlas) for path in paths)
+
+    def write_map(self, merged: Merged) -> None:
+        """Put the one map of all submaps on disk."""
+        arrays = {
+            **archive.pack_submap(merged.submap),
+            "T_world_maps": np.stack([T.numpy() for T in merged.T_world_map]),
+            "exposures": np.array([astuple(exposure) for exposure in merged.exposures]),
+            "steps": np.array(merged.steps),
+        }
+        archive.write_arrays(self.path / "map.npz", "map", arrays)
+
+    def load_map(self) -> Merged | None:
+        """The one map as last written; None if there is none, or the submaps are others now, or stand elsewhere.
+
+        Raises:
+            ArchiveError: if a file is damaged or of another version.
+        """
+        path = self.path / "map.npz"
+        if not path.exists():
+            return None
+        arrays, submaps = archive.read_arrays(path, "map"), self.open_submaps()
+        T_world_map = tuple(torch.from_numpy(T) for T in arrays["T_world_maps"])
+        standing = tuple(submap.T_world_map for submap in submaps)
+        if len(standing) != len(T_world_map) or not all(map(torch.equal, standing, T_world_map)):
+            return None
+        exposures = tuple(Exposure(*pair) for pair in arrays["exposures"].tolist())
+        keyframes = WorldKeyframes([submap.keyframes for submap in submaps], T_world_map, exposures)
+        submap = archive.unpack_submap(path, arrays)
+        return Merged(replace(submap, keyframes=keyframes), T_world_map, exposures, int(arrays["steps"]))
 
     def write_trajectory(self, trajectory: Trajectory, atlas: Atlas) -> None:
         """Put the path so far on disk, exact (`trajectory.npz`) and in the world as text (`trajectory.txt`)."""
@@ -172,6 +215,12 @@ class RunDirectory:
 
     def _submap_path(self, index: int) -> Path:
         return self.path / "submaps" / f"{index:04d}.npz"
+
+
+def _standing(submap: Submap, atlas: Atlas) -> Submap:
+    """Where the atlas has it, if it does."""
+    known = submap.index < len(atlas)
+    return replace(submap, T_world_map=atlas.T_world_map[submap.index]) if known else submap
 
 
 def _read_json(path: Path, complaint: str) -> dict[str, object]:
