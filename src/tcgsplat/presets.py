@@ -161,6 +161,7 @@ _PUBLISHED: tuple[tuple[str, _Three, Origin, str], ...] = (
     ("loop.enabled", _same(True), "paper", "Section 3.3"),
     ("loop.descriptor", _same("vlad"), "ours", "the base system's NetVLAD needs weights: netvlad:PATH"),
     ("loop.min_similarity", _same(0.5), "base", "min_similarity"),
+    ("loop.min_score", _same(1.0), "base", "the rule as it is published"),
     ("loop.min_interval", (2, 3, 4), "base", "min_interval"),
     ("loop.candidates", _same(1000), "base", "all that are similar enough"),
     ("loop.preselected", _same(6), "paper", "Section 4.1"),

@@ -120,7 +120,9 @@ class Slam:
         self._tracker = Tracker(config.tracker, config.confidence, rasterizer)
         self._mapper = Mapper(config.mapper, config.confidence, rasterizer, self._ids, self._generator)
         self._schedule = Schedule(config.schedule)
-        self._closer = LoopCloser(config.loop, config.tracker, config.confidence, rasterizer, self._store.load_submap)
+        self._closer = LoopCloser(
+            config.loop, config.tracker, config.confidence, rasterizer, self._store.load_submap, config.seed
+        )
         self._mapping_thread = ThreadPoolExecutor(1, thread_name_prefix="mapping")
         self._updating: Future[tuple[Submap, MapUpdate]] | None = None
         self._since_mapped = 0

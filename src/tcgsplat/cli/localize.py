@@ -54,7 +54,7 @@ def command(args: Args) -> int:
     frames = frames_of(run, args.images, args.start, args.stride, args.limit)
     torch.set_num_threads(1)  # as in a run: the kernels have threads of their own
     compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
-    relocalizer = Relocalizer(config.loop, config.tracker, config.confidence, rasterizer, run.load_submap)
+    relocalizer = Relocalizer(config.loop, config.tracker, config.confidence, rasterizer, run.load_submap, config.seed)
     with counting("submap") as tell:
         for index in range(run.submap_count):
             tell(index, run.submap_count)

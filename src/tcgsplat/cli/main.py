@@ -29,8 +29,11 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "doctor": "say which backend this machine can use, and why not another",
     }
 )
-ENVIRONMENT: Mapping[str, str] = MappingProxyType({"NUMBA_THREADING_LAYER": "omp", "OMP_WAIT_POLICY": "passive"})
-"""Read by numba and by torch's OpenMP when they are imported: without it their waiting threads keep cores busy."""
+ENVIRONMENT: Mapping[str, str] = MappingProxyType(
+    {"NUMBA_THREADING_LAYER": "omp", "OMP_WAIT_POLICY": "passive", "OPENBLAS_NUM_THREADS": "1"}
+)
+"""Read by numba, torch's OpenMP and numpy's OpenBLAS when they are imported: without it their waiting threads keep
+cores busy. Numpy's matrices are small here."""
 
 DONE, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 """Exit codes."""

@@ -10,19 +10,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
-import torch
 
-from tcgsplat.confidence import equations as eq
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
-from tcgsplat.loop.places import Candidate, measured, view_confidence
+from tcgsplat.loop.descriptor import Vectors
+from tcgsplat.loop.places import measured
 from tcgsplat.loop.pose_graph import Edge, solved
 from tcgsplat.loop.registration import Registration, Side, registered
 from tcgsplat.loop.relocalization import Relocalized, Relocalizer
+from tcgsplat.loop.retrieval import Candidate
 from tcgsplat.loop.settings import LoopConfig
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.render.view import SubmapView
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
@@ -70,13 +68,13 @@ class LoopCloser:
         confidence: ConfidenceConfig,
         rasterizer: Rasterizer,
         load: Callable[[int], Submap],
+        seed: int,
     ) -> None:
         self.edges: tuple[Edge, ...] = ()
         self._config = config
         self._confidence = confidence
-        self._rasterizer = rasterizer
         self._load = load
-        self._relocalizer = Relocalizer(config, tracker, confidence, rasterizer, load)
+        self._relocalizer = Relocalizer(config, tracker, confidence, rasterizer, load, seed)
 
     def follow(self, edge: Edge) -> None:
         """Take in that a submap has begun where one of its frames was tracked in another."""
@@ -100,8 +98,8 @@ class LoopCloser:
         self._relocalizer.remember(submap)
         submap = measured(submap)
         registrations = []
-        for candidate in self._relocalizer.places.candidates(index, self._config):
-            T_other_this = se3.inverse(T_world_map[candidate.index]) @ T_world_map[index]
+        for candidate in self._relocalizer.places.candidates(index, T_world_map, self._config):
+            T_other_this = se3.inverse(T_world_map[candidate.submap]) @ T_world_map[index]
             registrations.append(self._registered(submap, candidate, T_other_this))
         loops = [
             Edge(pair.source, pair.target, pair.T_target_source, pair.information, loop=True)
@@ -122,27 +120,17 @@ class LoopCloser:
         )
 
     def _registered(self, submap: Submap, candidate: Candidate, T_other_this: Pose) -> Registration:
-        other = measured(self._load(candidate.index))
-        similarity = candidate.similarity
-        sides = []
-        for one, scores in ((submap, similarity.max(axis=1)), (other, similarity.max(axis=0))):
-            sides.append(Side(one, self._relocalizer.places[one.index], self._viewpoints(one, scores)))
-        pair = registered(sides[0], sides[1], similarity, T_other_this, self._relocalizer.localizer)
+        other, similarity = measured(self._load(candidate.submap)), candidate.similarity
+        source, target = self._side(submap, similarity), self._side(other, similarity.T)
+        pair = registered(source, target, similarity, T_other_this, self._relocalizer.localizer)
         log = logger.debug if pair.failed else logger.info
         log("submap %d to %d: %s", pair.source, pair.target, pair.failed or "registered")
         return pair
 
-    def _viewpoints(self, submap: Submap, scores: npt.NDArray[np.float32]) -> tuple[int, ...]:
-        """The views that a submap is registered by: preselected by their scores, ranked anew by Eq. 25."""
-        chosen = np.argsort(-scores, kind="stable")[: self._config.preselected]
-        ranked = torch.from_numpy(scores[chosen])
-        if self._confidence.rerank_views:
-            view = SubmapView(submap, self._rasterizer)
-            frames = [submap.keyframes[i] for i in chosen]
-            confidence = [view_confidence(view(frame.frame.camera, frame.T_map_cam)) for frame in frames]
-            ranked = eq.rerank_score(ranked, torch.tensor(confidence), floor=self._confidence.view_floor)
-        kept = torch.argsort(-ranked, stable=True)[: self._config.views].tolist()
-        return tuple(int(chosen[i]) for i in kept)
+    def _side(self, submap: Submap, similarity: Vectors) -> Side:
+        places, confidence = self._relocalizer.places, self._confidence
+        floor = confidence.view_floor if confidence.rerank_views else None
+        return Side(submap, places[submap.index], places.viewpoints(submap.index, similarity, self._config, floor))
 
     def relocalized(self, frame: Frame, active: Submap) -> Relocalized | None:
         """Where a lost camera is, if the place is known: in the active submap rather than in another one."""

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from tcgsplat.confidence.state import ConfidenceConfig
+from tcgsplat.loop.descriptor import open_descriptor
 from tcgsplat.loop.features import features
 from tcgsplat.loop.localizer import Localizer
 from tcgsplat.loop.places import Place, Places, measured
@@ -35,10 +36,12 @@ class Relocalizer:
         confidence: ConfidenceConfig,
         rasterizer: Rasterizer,
         load: Callable[[int], Submap],
+        seed: int,
     ) -> None:
-        self.places = Places()
+        self.places = Places(open_descriptor(config.descriptor, seed=seed), rasterizer)
         self.localizer = Localizer(config, tracker, confidence, rasterizer)
         self._load = load
+        self._rasterizer = rasterizer
         self._limit = config.candidates
 
     def remember(self, submap: Submap) -> None:
@@ -56,11 +59,11 @@ class Relocalizer:
         """
         seen = features(frame)
         if active is not None and active.keyframes:
-            place = Place.of(active)
+            place = Place.of(active, self._rasterizer)
             found = self._within(active, place.guess(seen, frame.camera, range(len(place.views))), frame)
             if found is not None:
                 return found
-        for index, views in self.places.similar(seen, self._limit):
+        for index, views in self.places.similar(frame, seen, self._limit):
             guess = self.places[index].guess(seen, frame.camera, views)
             found = None if guess is None else self._within(measured(self._load(index)), guess, frame)
             if found is not None:

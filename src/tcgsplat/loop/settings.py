@@ -16,15 +16,19 @@ class LoopConfig:
     yours: `netvlad:PATH`, `torchscript:PATH`. [ours] (base: NetVLAD)"""
     min_similarity: float = 0.5
     """Quantile of a view's similarity to its own submap that a view of another one must exceed. [base]"""
+    min_score: float = 0.2
+    """How much more alike than strangers two submaps must look, where 1 is the rule of the base system; see
+    `retrieval.candidates`. [ours] (base: 1)"""
     min_interval: int = 1
     """Submaps nearer in the sequence than this one are no loop. [ours]: an odometry edge hangs on one picture, and
     registering the next but one steadies it (base: 2 to 4)"""
     candidates: int = 4
     """Most submaps that one is registered with, the most similar first: bounds the time of a closure. [ours]"""
-    preselected: int = 6
-    """Viewpoints a side that equation 25 ranks anew. [paper]"""
-    views: int = 2
-    """Viewpoints a side that are registered. [paper]"""
+    preselected: int = 8
+    """Viewpoints a side that equation 25 ranks anew. [ours] (paper: 6)"""
+    views: int = 4
+    """Viewpoints a side that are registered; one takes some ten milliseconds, and errors of views average out. [ours]
+    (paper: 2)"""
     min_coverage: float = 0.3
     """Share of a picture that the other submap must cover for its pose there to count: below it, poses on synthetic
     data with a Kinect's noise were off by centimetres. [ours] (base: overlap of centres 0.2)"""
@@ -44,7 +48,7 @@ class LoopConfig:
         for name in ("min_interval", "lag"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"loop.{name} is {getattr(self, name)!r}; it must be at least 0")
-        for name in ("min_similarity", "min_coverage", "min_agreement", "min_correlation"):
+        for name in ("min_score", "min_similarity", "min_coverage", "min_agreement", "min_correlation"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"loop.{name} is {getattr(self, name)!r}; it must be between 0 and 1")
         kind, colon, path = self.descriptor.partition(":")

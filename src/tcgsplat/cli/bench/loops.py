@@ -90,7 +90,7 @@ def replayed(run: RunDirectory, rasterizer: Rasterizer) -> list[Closure]:
         raise ArchiveError(f"{run.path} has fewer than two submaps and no loops; give a longer run")
     config = from_toml(run.config_toml)
     closer = LoopCloser(
-        replace(config.loop, enabled=True), config.tracker, config.confidence, rasterizer, run.load_submap
+        replace(config.loop, enabled=True), config.tracker, config.confidence, rasterizer, run.load_submap, config.seed
     )
     odometry = {edge.source: edge for edge in checkpoint.edges if not edge.loop}
     _, atlas = run.trajectory()
