@@ -75,11 +75,15 @@ def relative_pose(
     b: Features,
     camera_a: Camera,
     *,
-    min_inliers: int = 40,
-    min_share: float = 0.12,
-    max_position_error: float = 0.08,
+    min_inliers: int = 80,
+    min_share: float = 0.15,
+    max_position_error: float = 0.06,
 ) -> Found | None:
     """Locate a camera against what another one, or a whole map, has seen. The same every time.
+
+    The defaults are for believing the pose as it is: of 2782 pairs of pictures that share a twentieth to all of what
+    they see, synthetic with and without a Kinect's noise and of TUM RGB-D, 45 % were found, and one pose was wrong by
+    more than 10 cm or 4 degrees. With 40, 0.12 and 0.08 it was 55 % and 26: better where every pose is verified.
 
     Args:
         a: Features of the picture to locate; without depth it works too.
