@@ -8,6 +8,7 @@ submap and where it stands. Progress and pictures are made by whoever consumes t
 """
 
 import time
+from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -18,6 +19,7 @@ from tcgsplat.config import SlamConfig
 from tcgsplat.geometry import se3
 from tcgsplat.loop.closer import Closure, LoopCloser, odometry
 from tcgsplat.loop.places import measured
+from tcgsplat.loop.pose_graph import Edge
 from tcgsplat.loop.relocalization import Relocalized
 from tcgsplat.mapping.completion import completed
 from tcgsplat.mapping.feedback import judged
@@ -127,7 +129,7 @@ class Slam:
         self._updating: Future[tuple[Submap, MapUpdate]] | None = None
         self._since_mapped = 0
         self._keeping_thread = ThreadPoolExecutor(1, thread_name_prefix="keeping")
-        self._keeping: Future[Closure] | None = None
+        self._keeping: deque[Future[Closure]] = deque()
         self._since_sealed = 0
         self._resumed_at: int | None = None
         self._synchronizes = config.tracker.synchronization != "none"
@@ -154,8 +156,9 @@ class Slam:
         slam._ids.next, slam._resumed_at = then.next_id, then.frame_index
         slam._generator.set_state(then.generator)
         if config.loop.enabled:
-            slam._closer.restore(then.sealed - 1, then.edges)
-            slam._keeping = slam._keeping_thread.submit(slam._closer.closed, then.sealed - 1, then.atlas.T_world_map)
+            *edges, newest = then.edges
+            slam._closer.restore(then.atlas.T_world_map[:-1], edges)
+            slam._keeping.append(slam._keeping_thread.submit(slam._closer.closed, then.sealed - 1, newest))
         return slam
 
     def step(self, frame: Frame) -> StepReport:
@@ -176,31 +179,28 @@ class Slam:
         clock.lap("track")
 
         # Lost for a while: the place is looked up, in this submap and in all before.
-        if self.lost and self.lost % self.config.loop.relocalize_after == 0 and self.config.loop.enabled:
+        if self._looks_up and frame.has_depth:
             update, closure = self._finished_update() or update, self._finished_closure() or closure
             found = self._closer.relocalized(self._synchronized(frame), self.submap)
             clock.lap("relocalize")
         if found is not None:
             self.lost, tracked = 0, found.tracked
             T_map_cam, exposure = tracked.T_map_cam, tracked.exposure
-            if found.reference is self.submap:
-                self.motion = self.motion.advanced(T_map_cam, frame.timestamp)
+            self.motion = self.motion.advanced(T_map_cam, frame.timestamp)
+        elsewhere = found.reference if found is not None and found.reference is not self.submap else None
 
-        # Switch: seal the submap and anchor the next one at this camera (equation 16), which may stand elsewhere.
+        # Switch: seal the submap and anchor the next one at this camera (equation 16), which may be in an old submap.
         may_map = tracked.converged and not (self._live and self._updates)
-        elsewhere = found is not None and found.reference is not self.submap
         switches = may_map and self._schedule.switches_submap(frame.index, T_map_cam, self.submap) and frame.has_depth
-        if elsewhere or switches:
+        if switches or elsewhere is not None:
             fresh = self._finished_update()
-            closure = self._finished_closure() or closure
+            closure = closure if self._live else self._finished_closure() or closure
             clock.lap("wait")
-            if (
-                fresh is not None and not elsewhere
-            ):  # all that follows hangs on this pose: found again in the newest map
+            if fresh is not None:  # all that follows hangs on this pose: it is found again in the newest map
                 update, anchor = fresh, self._tracked(self._synchronized(frame), guess=T_map_cam)
                 tracked = anchor if anchor.converged else tracked
                 clock.lap("track")
-            sealed = self._switched(frame.index, tracked, found.reference if found is not None else None)
+            sealed = self._switched(frame.index, tracked, elsewhere)
             T_map_cam, exposure = se3.identity(), UNCHANGED
 
         # Map: grow where the view is new, and have it all optimised and judged while the next frames are tracked.
@@ -252,7 +252,7 @@ class Slam:
         if not self.submap.keyframes:
             return None
         sealed = self._sealed()
-        self._keeping = self._keeping_thread.submit(self._kept, sealed, None)
+        self._keeping.append(self._keeping_thread.submit(self._kept, sealed, None, None))
         self._finished_closure()
         return sealed
 
@@ -299,22 +299,26 @@ class Slam:
         self.atlas = self.atlas.with_submap(self.submap.T_world_map)
         self.motion = self.motion.rebased()
         self._reference = Reference(reference, se3.inverse(tracked.T_map_cam), tracked.exposure)
-        self._closer.follow(edge)
-        checkpoint = Checkpoint(
-            frame_index=frame_index,
-            sealed=index,
-            trajectory=self.trajectory,
-            atlas=self.atlas,
-            edges=self._closer.edges,
-            motion=self.motion,
-            delay=self.delay,
-            reference=reference.index,
-            T_map_reference=self._reference.T_map_reference,
-            exposure=self._reference.exposure,
-            next_id=self._ids.next,
-            generator=self._generator.get_state(),
+        # What a live system has found out is not waited for, so there is no moment at which all of it is known.
+        checkpoint = (
+            None
+            if self._live
+            else Checkpoint(
+                frame_index=frame_index,
+                sealed=index,
+                trajectory=self.trajectory,
+                atlas=self.atlas,
+                edges=(*self._closer.edges, edge),
+                motion=self.motion,
+                delay=self.delay,
+                reference=reference.index,
+                T_map_reference=self._reference.T_map_reference,
+                exposure=self._reference.exposure,
+                next_id=self._ids.next,
+                generator=self._generator.get_state(),
+            )
         )
-        self._keeping = self._keeping_thread.submit(self._kept, sealed, checkpoint)
+        self._keeping.append(self._keeping_thread.submit(self._kept, sealed, checkpoint, edge))
         self._since_sealed = 0
         return sealed
 
@@ -323,16 +327,13 @@ class Slam:
         sealed = self.submap.sealed(self.config.confidence)
         return replace(sealed, T_world_map=self.atlas.T_world_map[sealed.index])
 
-    def _kept(self, sealed: Submap, checkpoint: Checkpoint | None) -> Closure:
+    def _kept(self, sealed: Submap, checkpoint: Checkpoint | None, edge: Edge | None) -> Closure:
         """Put a finished submap away, its holes closed by guesses, and compare it; runs beside all else."""
         whole = sealed
         if self.config.mapper.complete:
             whole = completed(sealed, self.config.mapper.seeding, self.config.confidence, self._rasterizer)
         self._store.keep(whole, checkpoint)
-        atlas = self.atlas if checkpoint is None else checkpoint.atlas
-        if not self.config.loop.enabled:
-            return Closure(sealed.index)
-        return self._closer.closed(sealed.index, atlas.T_world_map)
+        return self._closer.closed(sealed.index, edge) if self.config.loop.enabled else Closure(sealed.index)
 
     def _updated(self, grown: Grown) -> tuple[Submap, MapUpdate]:
         """Optimise (equations 20 to 24), then judge what moved (equations 4 to 15); runs beside tracking."""
@@ -357,8 +358,14 @@ class Slam:
     def _adopts_closure(self) -> bool:
         """Whether the closure under way comes into use now."""
         if self._live:
-            return self._keeping is not None and self._keeping.done()
+            return bool(self._keeping) and self._keeping[-1].done()
         return self._since_sealed >= self.config.loop.lag
+
+    @property
+    def _looks_up(self) -> bool:
+        """Whether the camera has been lost for so long that its place is looked up now."""
+        config = self.config.loop
+        return config.enabled and self.lost > 0 and self.lost % config.relocalize_after == 0
 
     def _finished_update(self) -> MapUpdate | None:
         """Wait for the update that is under way, if any, and use its map from now on."""
@@ -370,13 +377,13 @@ class Slam:
         return update
 
     def _finished_closure(self) -> Closure | None:
-        """Wait for the closure that is under way, if any; the submaps stand where it says from now on."""
-        if self._keeping is None:
-            return None
-        closure, self._keeping = self._keeping.result(), None
-        self.atlas = self.atlas.corrected(closure.corrections)
-        self.closures = (*self.closures, closure)
-        return closure
+        """Wait for the closures that are under way, if any; the submaps stand where the last one says from now on."""
+        closures = [closing.result() for closing in self._keeping]
+        self._keeping.clear()
+        self.closures = (*self.closures, *closures)
+        for closure in closures:
+            self.atlas = self.atlas.corrected(closure.T_world_map)
+        return closures[-1] if closures else None
 
     def _refer_to(self, submap: Submap) -> None:
         """Track against the active submap from now on, if there is anything in it."""

@@ -243,7 +243,7 @@ def test_correcting_a_submap_moves_its_frames_and_no_others() -> None:
     T_map_cam, T_shift = se3.exp(row(1, 2, 3, 0.1, 0.2, 0.3)), se3.exp(row(0, 0, 1, 0, 0, 1))
     atlas = Atlas().with_submap(se3.identity()).with_submap(se3.identity())
     trajectory = Trajectory().with_row(TrackedPose(0, 0.0, 0, T_map_cam)).with_row(TrackedPose(1, 0.1, 1, T_map_cam))
-    first, second = trajectory.world(atlas.corrected({1: T_shift}))
+    first, second = trajectory.world(atlas.corrected((se3.identity(), T_shift)))
     assert torch.equal(first, T_map_cam)
     torch.testing.assert_close(second, T_shift @ T_map_cam)
 

@@ -274,7 +274,7 @@ def test_a_map_comes_back_from_disk(run: RunDirectory, rasterizer: Rasterizer) -
 def test_a_map_of_other_submaps_or_poses_is_not_taken(run: RunDirectory, rasterizer: Rasterizer) -> None:
     run.write_map(replace(world_map(run, rasterizer), steps=7))
     trajectory, atlas = run.trajectory()
-    run.write_trajectory(trajectory, atlas.corrected({1: pose(0.001) @ atlas.T_world_map[1]}))
+    run.write_trajectory(trajectory, atlas.corrected((atlas.T_world_map[0], pose(0.001) @ atlas.T_world_map[1])))
     assert run.load_map() is None and world_map(run, rasterizer).steps == 0
     run.write_trajectory(trajectory, atlas)
     assert run.load_map() is not None

@@ -244,7 +244,7 @@ def test_closure_moves_submaps_through_the_trajectory_alone(tmp_path: Path, gene
     run.write_submap(submap)
     before = (run.path / "submaps" / "0000.npz").read_bytes()
     moved = random_pose(generator)
-    run.write_trajectory(Trajectory(), Atlas((submap.T_world_map,)).corrected({0: moved}))
+    run.write_trajectory(Trajectory(), Atlas((submap.T_world_map,)).corrected((moved,)))
     assert torch.equal(run.load_submap(0).T_world_map, moved)
     assert (run.path / "submaps" / "0000.npz").read_bytes() == before
 

@@ -115,12 +115,21 @@ def test_moving_a_submap_moves_every_frame_that_was_tracked_in_it() -> None:
     trajectory = Trajectory()
     for index, submap in enumerate([0, 0, 1, 1]):
         trajectory = trajectory.with_row(TrackedPose(index, index / 30, submap, pose(0, 0, 0.1 * index)))
-    moved = atlas.corrected({1: pose(1, 5)})
+    moved = atlas.corrected((pose(0), pose(1, 5)))
     before, after = trajectory.world(atlas), trajectory.world(moved)
     assert len(trajectory) == 4
     assert all(torch.equal(a, b) for a, b in zip(before[:2], after[:2], strict=True))
     for a, b in zip(before[2:], after[2:], strict=True):
         torch.testing.assert_close(se3.inverse(a) @ b, pose(0, 5))
+
+
+def test_submaps_that_have_begun_since_move_with_the_last_that_was_corrected() -> None:
+    atlas = Atlas().with_submap(pose(0)).with_submap(pose(1)).with_submap(pose(3))
+    moved = atlas.corrected((pose(0), pose(1, 5)))
+    between = [se3.inverse(one.T_world_map[1]) @ one.T_world_map[2] for one in (atlas, moved)]
+    torch.testing.assert_close(between[1], between[0])
+    torch.testing.assert_close(moved.T_world_map[2], pose(3, 5))
+    assert atlas.corrected(()) == atlas
 
 
 def test_velocity_is_the_cameras_own_and_goes_on_across_submaps() -> None:

@@ -6,8 +6,8 @@ only when it is to be registered.
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,8 +35,8 @@ class Closure:
 
     submap: int
     """The one that was compared."""
-    corrections: Mapping[int, Pose] = field(default_factory=dict)
-    """`T_world_map` of every submap that is to stand elsewhere; empty if nothing new was learnt."""
+    T_world_map: tuple[Pose, ...] = ()
+    """Where all submaps stand by now, also those that had only begun; empty if they stand where they stood."""
     registrations: tuple[Registration, ...] = ()
     """With each candidate; those that failed say why."""
     edges: tuple[Edge, ...] = ()
@@ -70,56 +70,51 @@ class LoopCloser:
         load: Callable[[int], Submap],
         seed: int,
     ) -> None:
+        self.T_world_map: tuple[Pose, ...] = (se3.identity(),)
         self.edges: tuple[Edge, ...] = ()
+        self.rejected: tuple[Edge, ...] = ()
         self._config = config
         self._confidence = confidence
         self._load = load
         self._relocalizer = Relocalizer(config, tracker, confidence, rasterizer, load, seed)
 
-    def follow(self, edge: Edge) -> None:
-        """Take in that a submap has begun where one of its frames was tracked in another."""
-        self.edges = (*self.edges, edge)
-
-    def restore(self, count: int, edges: Sequence[Edge]) -> None:
-        """Know the first so many submaps again, and the edges that there were."""
-        self.edges = tuple(edges)
-        for index in range(count):
+    def restore(self, T_world_map: Sequence[Pose], edges: Sequence[Edge]) -> None:
+        """Know again what was known when the last of these submaps began."""
+        self.T_world_map, self.edges = tuple(T_world_map), tuple(edges)
+        for index in range(len(T_world_map) - 1):
             self._relocalizer.remember(self._load(index))
 
-    def closed(self, index: int, T_world_map: Sequence[Pose]) -> Closure:
-        """Compare a finished submap with those before it; call it once for each, in their order.
+    def closed(self, index: int, following: Edge | None) -> Closure:
+        """Compare a finished submap, which can be read back by now, with those before it; once each, in their order.
 
         Args:
-            index: Of the submap, which can be read back by now.
-            T_world_map: Where all submaps stand, those included that have begun since.
+            index: Of the submap.
+            following: From the submap that has begun since to the one where its first frame was tracked.
         """
         started = time.perf_counter()
+        if following is not None:
+            self.edges = (*self.edges, following)
+            T_world_map = self.T_world_map[following.target] @ following.T_target_source
+            self.T_world_map = (*self.T_world_map, se3.orthonormalized(T_world_map))
         submap = self._load(index)
         self._relocalizer.remember(submap)
-        submap = measured(submap)
-        registrations = []
-        for candidate in self._relocalizer.places.candidates(index, T_world_map, self._config):
-            T_other_this = se3.inverse(T_world_map[candidate.submap]) @ T_world_map[index]
-            registrations.append(self._registered(submap, candidate, T_other_this))
-        loops = [
+        candidates = self._relocalizer.places.candidates(index, self.T_world_map, self._config)
+        registrations = tuple(self._registered(measured(submap), candidate) for candidate in candidates)
+        loops = tuple(
             Edge(pair.source, pair.target, pair.T_target_source, pair.information, loop=True)
             for pair in registrations
             if not pair.failed
-        ]
-        if not loops:
-            return Closure(index, registrations=tuple(registrations), edges=self.edges, seconds=_since(started))
-        self.edges = (*self.edges, *loops)
-        solution = solved(T_world_map, self.edges)
-        return Closure(
-            index,
-            {i: T for i, (T, was) in enumerate(zip(solution.T_world_map, T_world_map, strict=True)) if T is not was},
-            tuple(registrations),
-            self.edges,
-            tuple(self.edges[i] for i in solution.rejected),
-            _since(started),
         )
+        if not loops:
+            return Closure(index, (), registrations, self.edges, self.rejected, time.perf_counter() - started)
+        self.edges = (*self.edges, *loops)
+        solution = solved(self.T_world_map, self.edges)
+        self.T_world_map, self.rejected = solution.T_world_map, tuple(self.edges[i] for i in solution.rejected)
+        seconds = time.perf_counter() - started
+        return Closure(index, self.T_world_map, registrations, self.edges, self.rejected, seconds)
 
-    def _registered(self, submap: Submap, candidate: Candidate, T_other_this: Pose) -> Registration:
+    def _registered(self, submap: Submap, candidate: Candidate) -> Registration:
+        T_other_this = se3.inverse(self.T_world_map[candidate.submap]) @ self.T_world_map[submap.index]
         other, similarity = measured(self._load(candidate.submap)), candidate.similarity
         source, target = self._side(submap, similarity), self._side(other, similarity.T)
         pair = registered(source, target, similarity, T_other_this, self._relocalizer.localizer)
@@ -135,7 +130,3 @@ class LoopCloser:
     def relocalized(self, frame: Frame, active: Submap) -> Relocalized | None:
         """Where a lost camera is, if the place is known: in the active submap rather than in another one."""
         return self._relocalizer.relocalized(frame, active)
-
-
-def _since(started: float) -> float:
-    return time.perf_counter() - started

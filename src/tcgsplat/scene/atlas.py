@@ -1,8 +1,9 @@
 """Where the submaps of a run stand in the world. The submaps themselves are on disk once sealed."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from tcgsplat.geometry import se3
 from tcgsplat.tensors import Pose
 
 
@@ -19,6 +20,14 @@ class Atlas:
         """With the next submap's pose."""
         return Atlas((*self.T_world_map, T_world_map))
 
-    def corrected(self, corrections: Mapping[int, Pose]) -> "Atlas":
-        """With the poses of some submaps replaced: what loop closure does, and all that it does."""
-        return Atlas(tuple(corrections.get(i, T) for i, T in enumerate(self.T_world_map)))
+    def corrected(self, T_world_map: Sequence[Pose]) -> "Atlas":
+        """With the first submaps standing elsewhere: what loop closure does, and all that it does.
+
+        Those that have begun since then keep where they stand to the last of these.
+        """
+        known = len(T_world_map)
+        if not known:
+            return self
+        moved = T_world_map[-1] @ se3.inverse(self.T_world_map[known - 1])
+        since = self.T_world_map[known:]
+        return Atlas((*T_world_map, *(se3.orthonormalized(moved @ T) for T in since)))

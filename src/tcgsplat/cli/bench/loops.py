@@ -92,15 +92,12 @@ def replayed(run: RunDirectory, rasterizer: Rasterizer) -> list[Closure]:
     closer = LoopCloser(
         replace(config.loop, enabled=True), config.tracker, config.confidence, rasterizer, run.load_submap, config.seed
     )
-    odometry = {edge.source: edge for edge in checkpoint.edges if not edge.loop}
-    _, atlas = run.trajectory()
+    following = {edge.source: edge for edge in checkpoint.edges if not edge.loop}
     closures = []
     with counting("submap") as tell:
         for index in range(run.submap_count):
             tell(index, run.submap_count)
-            if index + 1 in odometry:
-                closer.follow(odometry[index + 1])
-            closures.append(closer.closed(index, atlas.T_world_map[: index + 2]))
+            closures.append(closer.closed(index, following.get(index + 1)))
     return closures
 
 
