@@ -24,7 +24,7 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "localize": "find where in a finished map pictures were taken",
         "export": "write a run's map as one PLY file and its trajectory as text",
         "synth": "write the synthetic apartment as an RGB-D folder",
-        "bench": "measure how long the stages take on this machine",
+        "bench": "measure how long the stages take on this machine, and what confidence is worth",
         "presets": "list the presets, or every value of one with its origin",
         "doctor": "say which backend this machine can use, and why not another",
     }
