@@ -139,7 +139,7 @@ def run(tmp_path: Path, rasterizer: Rasterizer) -> RunDirectory:
                 submap = replace(submap, keyframes=(*submap.keyframes, keyframe))
         run.write_submap(submap)
     run.write_trajectory(Trajectory(tuple(rows)), atlas)
-    run.write_summary({"frames": 8, "ms_per_frame": 250.0, "peak_rss_mb": 512.5, "stage_ms": {"track": 1.0}})
+    run.write_summary({"frames": 8, "loops": 3, "ms_per_frame": 250.0, "peak_rss_mb": 512.5, "stage_ms": {"track": 1.0}})
     return run
 
 
@@ -186,6 +186,8 @@ def test_figures_of_a_run(run: RunDirectory, sequence: Recorded, rasterizer: Ras
     assert value["depth_l1_map_withheld"] == pytest.approx(100 * OFFSET, abs=0.1)
     assert value["depth_coverage"] == pytest.approx(100.0)
     assert (value["frames"], value["frames_lost"], value["submaps"]) == (8, 1, 2)
+    assert value["seconds_lost"] == 0.0  # the last frame is lost, and nothing comes after it
+    assert value["loops"] == 3
     assert value["gaussians"] == 2 * len(wall(0, at(0.0)))
     assert (value["ms_per_frame"], value["peak_rss_mb"]) == (250.0, 512.5)
     assert report.missing == {}
@@ -194,7 +196,7 @@ def test_figures_of_a_run(run: RunDirectory, sequence: Recorded, rasterizer: Ras
         "psnr_withheld_unexposed": "dB", "psnr_withheld_mapped": "dB", "coverage_withheld": "%",
         "psnr_map_withheld": "dB", "ssim_map_withheld": "", "depth_l1_map_withheld": "cm", "coverage_map_withheld": "%",
         "psnr": "dB", "ssim": "", "depth_l1": "cm", "depth_coverage": "%", "frames": "",
-        "frames_lost": "", "submaps": "", "gaussians": "", "gaussians_map": "",
+        "frames_lost": "", "seconds_lost": "s", "loops": "", "submaps": "", "gaussians": "", "gaussians_map": "",
         "ms_per_frame": "ms", "peak_rss_mb": "MB",
     }  # fmt: skip
     assert list(unit)[:12] == ["ate_rmse", *(name for name in unit if "withheld" in name), "psnr"]
@@ -415,7 +417,7 @@ def test_killed_run_without_data_is_still_scored(run: RunDirectory, rasterizer: 
     assert report.metrics["submaps"].value == 1
     assert report.metrics["psnr"].value > 50.0
     withheld = {name for name in report.missing if "withheld" in name}
-    assert report.missing.keys() == {"ate_rmse", "ms_per_frame", "peak_rss_mb"} | withheld
+    assert report.missing.keys() == {"ate_rmse", "loops", "ms_per_frame", "peak_rss_mb"} | withheld
     assert len(withheld) == 10
     assert report.missing["psnr_withheld"] == "the sequence is not at hand"
     assert report.evaluated["withheld"].startswith("0 of 2 frames")

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -145,7 +144,7 @@ class Tally:
         return Summary(
             frames=len(rows),
             frames_lost=sum(row.lost for row in rows),
-            seconds_lost=sum(b.timestamp - a.timestamp for a, b in pairwise(rows) if a.lost),
+            seconds_lost=trajectory.seconds_lost,
             submaps=submaps,
             gaussians=gaussians,
             loops=len(loops) - rejected,

@@ -132,7 +132,7 @@ def evaluate(
     - `psnr_map_withheld` (dB), `ssim_map_withheld`, `depth_l1_map_withheld` (cm), `coverage_map_withheld` (%): the same
       frames in the one map.
     - `psnr` (dB), `ssim`, `depth_l1` (cm), `depth_coverage` (%): the keyframes, which the map was optimised on.
-    - `frames`, `frames_lost`, `submaps`, `gaussians` (of all submaps), `gaussians_map` (of the one map), and from the
+    - `frames`, `frames_lost`, `seconds_lost` (of the recording), `loops` (from the summary), `submaps`, `gaussians` (of all submaps), `gaussians_map` (of the one map), and from the
       run's summary `ms_per_frame` and `peak_rss_mb`.
     - Of a run in real time, from its summary: `frames_dropped`, and `ms_late`, the median from a frame's capture to its
       pose.
@@ -172,6 +172,7 @@ def evaluate(
         **_quality(run, whole, sequence, rasterizer, stride, drawn, drawn_frame),
         "frames": Metric(len(trajectory)),
         "frames_lost": Metric(sum(row.lost for row in trajectory.rows)),
+        "seconds_lost": Metric(trajectory.seconds_lost, "s"),
         **_cost(run.summary()),
     }
     return Report(
@@ -325,9 +326,12 @@ def _means(scores: list[ViewScore], metrics: tuple[tuple[str, str, str], ...], n
 
 def _cost(summary: Mapping[str, object]) -> dict[str, Metric | str]:
     ms_per_frame, peak = (summary.get(name) for name in ("ms_per_frame", "peak_rss_mb"))
+    loops = summary.get("loops")
     dropped, late = (summary.get(name) for name in ("frames_dropped", "ms_late_median"))
     absent = "summary.json does not tell" if summary else "no summary.json: the run has not ended, or was killed"
-    rows: dict[str, Metric | str] = {"ms_per_frame": absent, "peak_rss_mb": absent}
+    rows: dict[str, Metric | str] = {"loops": absent, "ms_per_frame": absent, "peak_rss_mb": absent}
+    if isinstance(loops, int):
+        rows["loops"] = Metric(loops)
     if isinstance(ms_per_frame, int | float):
         rows["ms_per_frame"] = Metric(ms_per_frame, "ms")
     if isinstance(peak, int | float):

@@ -1,6 +1,7 @@
 """The camera's path, kept relative to submaps, so that moving a submap moves every frame that was tracked in it."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -43,6 +44,11 @@ class Trajectory:
     def with_row(self, row: TrackedPose) -> "Trajectory":
         """With one more frame."""
         return Trajectory((*self.rows, row))
+
+    @property
+    def seconds_lost(self) -> float:
+        """In which nobody knew where the camera was: from each lost frame to the next one."""
+        return sum(b.timestamp - a.timestamp for a, b in pairwise(self.rows) if a.lost)
 
     def world(self, atlas: Atlas) -> list[Pose]:
         """`T_world_cam` of every row; composed late, so that corrections of the atlas reach every frame."""
