@@ -132,8 +132,8 @@ def evaluate(
     - `psnr_map_withheld` (dB), `ssim_map_withheld`, `depth_l1_map_withheld` (cm), `coverage_map_withheld` (%): the same
       frames in the one map.
     - `psnr` (dB), `ssim`, `depth_l1` (cm), `depth_coverage` (%): the keyframes, which the map was optimised on.
-    - `frames`, `frames_lost`, `seconds_lost` (of the recording), `loops` (from the summary), `submaps`, `gaussians` (of all submaps), `gaussians_map` (of the one map), and from the
-      run's summary `ms_per_frame` and `peak_rss_mb`.
+    - `frames`, `frames_lost`, `seconds_lost` (of the recording), `submaps`, `gaussians` (of all submaps),
+      `gaussians_map` (of the one map), and from the run's summary `loops`, `ms_per_frame` and `peak_rss_mb`.
     - Of a run in real time, from its summary: `frames_dropped`, and `ms_late`, the median from a frame's capture to its
       pose.
 
