@@ -17,10 +17,13 @@ from analytic_room import CAMERA, Room, walk
 
 from tcgsplat.cli import demo
 from tcgsplat.cli.main import main
+from tcgsplat.cli.progress import RunProgress
+from tcgsplat.cli.recorder import Part, begin
 from tcgsplat.config import SlamConfig, from_toml, with_settings
 from tcgsplat.datasets import open_sequence
 from tcgsplat.geometry import se3
 from tcgsplat.scene.trajectory import format_tum, parse_tum
+from tcgsplat.slam import StepReport
 from tcgsplat.storage.ply import read_gaussians
 from tcgsplat.storage.run_directory import RunDirectory
 
@@ -324,6 +327,158 @@ def test_ctrl_c_saves_what_there_is(room_folder: Path, tmp_path: Path):
     assert 8 <= len(trajectory) < FRAMES
     assert {row.submap_index for row in trajectory.rows} == set(range(run.submap_count))
     assert main(["eval", str(out)]) == 0
+
+
+# Going on with an interrupted run.
+
+
+def cut_off(run: RunDirectory) -> RunDirectory:
+    """The run as if it had been killed just before its end: the last submap is to be made again."""
+    (run.path / "summary.json").unlink()
+    (run.path / "submaps" / "0002.npz").unlink()
+    return run
+
+
+def resumed(room: Path, out: Path, *more: str) -> int:
+    return main(["run", str(room), *SHORT_SUBMAPS, "--out", str(out), "--resume", *more])
+
+
+def files(out: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def assert_same_run(ours: Path, theirs: Path) -> None:
+    """To the bit; but for pictures' compression and the like, the archives' bytes are those of their arrays."""
+    assert (ours / "trajectory.txt").read_bytes() == (theirs / "trajectory.txt").read_bytes()
+    names = [f"submaps/{path.name}" for path in sorted((theirs / "submaps").iterdir())]
+    assert names == [f"submaps/{path.name}" for path in sorted((ours / "submaps").iterdir())]
+    for name in (*names, "trajectory.npz", "checkpoint.npz"):
+        with np.load(ours / name, allow_pickle=False) as a, np.load(theirs / name, allow_pickle=False) as b:
+            assert a.files == b.files
+            assert all(a[entry].tobytes() == b[entry].tobytes() for entry in a.files), name
+
+
+def test_a_killed_run_is_resumed_as_if_nothing_had_happened(
+    finished: subprocess.CompletedProcess[str],
+    run: RunDirectory,
+    room_folder: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    assert resumed(room_folder, cut_off(run).path) == 0
+    said = capsys.readouterr()
+    assert said.err == "" and said.out.startswith(f"{FRAMES} frames in ")
+    assert_same_run(run.path, Path(finished.args[-1]))
+    summary = run.summary()
+    assert (summary["resumed_at"], summary["frames"], summary["submaps"]) == (16, FRAMES, 3)
+    assert summary["interrupted"] is False and summary["gaussians"] == run.gaussians
+    assert RunDirectory.open(Path(finished.args[-1])).summary()["resumed_at"] is None
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_without_a_sealed_submap_a_run_begins_anew(
+    begun: bool, finished: subprocess.CompletedProcess[str], room_folder: Path, tmp_path: Path
+):
+    out, whole = tmp_path / "run", Path(finished.args[-1])
+    if begun:
+        begin(out, from_toml(RunDirectory.open(whole).config_toml), room_folder, Part(), overwrite=False)
+    assert resumed(room_folder, out) == 0
+    assert RunDirectory.open(out).summary()["resumed_at"] is None
+    assert_same_run(out, whole)
+
+
+@pytest.mark.parametrize(
+    ("more", "sentence"),
+    [
+        (["--start", "1"], "Part(start=0, stride=1, limit=None); resume it with the same data"),
+        (["--stride", "2"], "Part(start=0, stride=1, limit=None); resume it with the same data"),
+        (["--limit", "20"], "Part(start=0, stride=1, limit=None); resume it with the same data"),
+        (
+            ["--mapper.iterations", "7", "--seed", "9"],
+            "has other settings: mapper.iterations was 10 and is 7; seed was 0 and is 9; resume it with the same ones",
+        ),
+        (["--preset", "paper-tum"], "has other settings: "),
+    ],
+)
+def test_another_run_is_not_resumed(
+    more: list[str], sentence: str, run: RunDirectory, room_folder: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = files(cut_off(run).path)
+    assert resumed(room_folder, run.path, *more) == 1
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1
+    assert said.err.startswith(f"tcgsplat: the run in {run.path} ") and sentence in said.err
+    assert files(run.path) == before
+
+
+def test_a_run_of_another_folder_is_not_resumed(
+    run: RunDirectory, room_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    other = Path(shutil.copytree(room_folder, tmp_path / "other"))
+    assert resumed(other, cut_off(run).path) == 1
+    assert f"the run in {run.path} is of {room_folder}, Part(" in capsys.readouterr().err
+
+
+def test_the_same_folder_may_be_named_otherwise(run: RunDirectory, room_folder: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(room_folder / "rgb")
+    assert resumed(Path(".."), cut_off(run).path) == 0
+
+
+def test_what_has_ended_or_is_damaged_is_not_resumed(
+    run: RunDirectory, room_folder: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = files(run.path)
+    assert resumed(room_folder, run.path) == 1
+    said = capsys.readouterr().err
+    assert said == (
+        f"tcgsplat: the run in {run.path} has ended, and there is nothing to resume; use --overwrite to repeat it\n"
+    )
+    assert files(run.path) == before
+
+    cut_off(run)
+    whole = (run.path / "checkpoint.npz").read_bytes()
+    (run.path / "checkpoint.npz").write_bytes(whole[: len(whole) // 2])
+    assert resumed(room_folder, run.path) == 1
+    assert f"{run.path / 'checkpoint.npz'} is not a complete archive" in capsys.readouterr().err
+    (run.path / "checkpoint.npz").write_bytes(whole)
+    (run.path / "submaps" / "0000.npz").unlink()
+    assert resumed(room_folder, run.path) == 1
+    assert f"{run.path} has lost submap 0 of 2; run again with --overwrite\n" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("flag", ["--overwrite", "--realtime"])
+def test_resume_goes_with_neither_a_new_run_nor_real_time(
+    flag: str, run: RunDirectory, room_folder: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = files(cut_off(run).path)
+    assert resumed(room_folder, run.path, flag) == 2
+    assert "tcgsplat: --resume goes with neither --overwrite nor --realtime" in capsys.readouterr().err
+    assert files(run.path) == before
+
+
+@pytest.mark.parametrize("at", [3, 12, 20])  # in the first submap, between, and in the last one
+def test_ctrl_c_and_on_again(
+    at: int, finished: subprocess.CompletedProcess[str], room_folder: Path, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+):  # fmt: skip
+    out, observe = tmp_path / "stopped", RunProgress.observe
+
+    def interrupting(progress: RunProgress, report: StepReport, dropped: int = 0) -> None:
+        observe(progress, report, dropped)
+        if report.frame_index == at:
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(RunProgress, "observe", interrupting)
+        assert main(["run", str(room_folder), *SHORT_SUBMAPS, "--out", str(out)]) == 130
+    run, sealed = RunDirectory.open(out), at // 8
+    assert (run.summary()["interrupted"], run.summary()["frames"]) == (True, at + 1)
+    assert run.submap_count == sealed + 1
+    assert main(["eval", str(out)]) == 0
+    capsys.readouterr()
+    assert resumed(room_folder, out) == 0
+    assert capsys.readouterr().out.startswith(f"{FRAMES} frames in ")
+    assert_same_run(out, Path(finished.args[-1]))
+    assert (run.summary()["interrupted"], run.summary()["resumed_at"]) == (False, 8 * sealed or None)
 
 
 def test_broken_frames_are_skipped_and_told(room_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
