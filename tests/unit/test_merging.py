@@ -88,6 +88,12 @@ def test_no_submap_is_an_empty_map(rasterizer: Rasterizer) -> None:
     assert len(merged([empty, replace(empty, index=1)], CONFIG, rasterizer).submap) == 0
 
 
+def test_an_empty_submap_changes_nothing(first: Submap, rasterizer: Rasterizer) -> None:
+    both = merged([first, Submap.anchored(pose(0.1), index=1)], CONFIG, rasterizer)
+    assert both.exposures == (UNCHANGED, UNCHANGED)
+    assert torch.equal(both.submap.gaussians.ids, first.gaussians.ids)
+
+
 @pytest.mark.parametrize(("apart", "most"), [(0.0, 1.001), (0.003, 1.02), (0.006, 1.06), (0.01, 1.25)])
 def test_a_copy_beside_itself_is_there_once(first: Submap, rasterizer: Rasterizer, apart: float, most: float) -> None:
     both = merged([first, copy_of(first, pose(apart, apart, apart))], CONFIG, rasterizer)
@@ -232,15 +238,38 @@ def test_guesses_yield_to_what_is_measured_and_to_free_space(first: Submap, rast
 
 def test_fields_are_sums_that_are_read_where_they_were_made() -> None:
     points = [np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]]), np.array([[0.05, 0.0, 0.0], [-7.0, 3.0, 1.0]])]
-    fields_ = Fields(points, [np.array([[1.0, 10.0], [2.0, 20.0]]), np.array([[4.0, 40.0], [8.0, 80.0]])], 0.1)
-    near = fields_.at_points_of(0)
-    assert near.shape == (2, 2, 2)
+    about = Fields(points, [np.array([[1.0, 10.0], [2.0, 20.0]]), np.array([[4.0, 40.0], [8.0, 80.0]])], 0.1)
+    submaps, near = about.near(points[0])
+    assert submaps.tolist() == [0, 1] and near.shape == (2, 2, 2)
     np.testing.assert_allclose(near[0, 0], [1.0 + 2.0 * 0.5, 10.0 + 20.0 * 0.5])
     np.testing.assert_allclose(near[1, 0], [0.5 * 1.0 + 0.5 * 2.0, 0.5 * 10.0 + 0.5 * 20.0])
     np.testing.assert_allclose(near[1, 1], [0.5 * 4.0, 0.5 * 40.0])
-    np.testing.assert_allclose(fields_.at_points_of(1)[1], [[0.0, 0.0], [8.0, 80.0]])
-    a, b = fields_.shared(0, 1)
+    submaps, alone = about.near(points[1][1:])
+    assert submaps.tolist() == [1]
+    np.testing.assert_allclose(alone, [[[8.0, 80.0]]])
+    a, b = about.shared(0, 1)
     assert len(a) == len(b) and a[:, 0].sum() == pytest.approx(3.0) and b[:, 0].sum() == pytest.approx(4.0)
+    assert about.overlaps(len(a)) == [(0, 1)] and about.overlaps(len(a) + 1) == []
+
+
+def test_what_others_have_looked_through_goes(first: Submap, rasterizer: Rasterizer) -> None:
+    """A speck before the wall that a submap took for real: its own pictures do not refute it, those of others do."""
+    place = 0.5 * CAMERA.backproject(first.keyframes[0].frame.depth)[20, 60][None]
+    speck = replace(first.gaussians.picked(torch.zeros(1, dtype=torch.int64)), ids=torch.tensor([99_000]), means=place)
+    specked = first.grown(speck, CONFIDENCE)
+
+    def has_speck(*submaps: Submap) -> bool:
+        return 99_000 in merged(submaps, CONFIG, rasterizer).submap.gaussians.ids.tolist()
+
+    assert has_speck(specked)
+    assert not has_speck(specked, copy_of(first, se3.identity()))
+    assert has_speck(specked, copy_of(first, pose(20.0)))
+    standing = [
+        replace(k, frame=replace(k.frame, depth=0.5 * k.frame.depth)) for k in first.keyframes
+    ]  # it stood there
+    assert has_speck(specked, replace(copy_of(first, se3.identity()), keyframes=tuple(standing)))
+    half = replace(specked, keyframes=(*specked.keyframes, *standing))  # as many have seen it as have looked through
+    assert has_speck(half, copy_of(first, se3.identity()))
 
 
 @pytest.fixture

@@ -10,6 +10,8 @@ _ENOUGH = 0.1
 """Summed confidence at a corner that makes its colour worth comparing: one Gaussian nearby."""
 _FEWEST = 50
 """Corners that two submaps must share."""
+_PER_CELL = 8.0
+"""Corners that one surface patch has spread to: they do not vote one by one."""
 _ROUNDS = 20
 _ERROR = 0.02
 """Of a pair's relative brightness, however many corners agree on it: surfaces look different from elsewhere."""
@@ -28,7 +30,7 @@ def exposures_of(fields: Fields) -> tuple[Exposure, ...]:
     """
     count = len(fields)
     gains, offsets = _Graph(count), _Graph(count)
-    pairs = {(a, b): pair for a in range(count) for b in range(a + 1, count) if (pair := _relative(fields, a, b))}
+    pairs = {(a, b): pair for a, b in fields.overlaps(_FEWEST) if (pair := _relative(fields, a, b))}
     for (a, b), (gain, _, sigma) in pairs.items():  # gain_a a + offset_a = gain_b b + offset_b
         gains.measure(a, b, float(np.log(gain)), sigma)
     gain_of = np.exp(gains.solved())
@@ -77,5 +79,7 @@ def _relative(fields: Fields, a: int, b: int) -> tuple[float, float, float] | No
         residual = np.abs(y - middle_y - gain * (x - middle_x))
         sigma = max(1.4826 * float(np.median(residual)), 1e-4)
         trusted = weight / (1.0 + (residual / (2.0 * sigma)) ** 2)
-    agreeing = max(trusted.sum() / weight.mean() / 3.0, 1.0)
-    return float(gain), float(middle_y - gain * middle_x), float(np.hypot(sigma / np.sqrt(agreeing), _ERROR))
+    contrast = np.sqrt(np.average((x - middle_x) ** 2, weights=trusted))
+    independent = max(trusted.sum() / weight.mean() / 3.0 / _PER_CELL, 1.0)
+    error = sigma / max(float(contrast), 1e-6) / np.sqrt(independent)
+    return float(gain), float(middle_y - gain * middle_x), float(np.hypot(error, _ERROR))

@@ -59,7 +59,7 @@ def completed(submap: Submap, config: SeedingConfig, confidence: ConfidenceConfi
         open_ = open_ & (guessed.depth > 0)
         seeds = surface_seeds(guessed, keyframe.T_map_cam, open_, submap.gaussians.sh_degree, ids, config)
         for other in submap.keyframes:
-            seeds = seeds.kept(~refuted(seeds.means, other, config.behind))
+            seeds = seeds.kept(~_refuted(seeds.means, other, config.behind))
         submap = submap.grown(seeds, lowest)
         view = SubmapView(submap, rasterizer)
     return submap
@@ -82,7 +82,7 @@ def _guessed_depth(frame: Frame) -> Plane:
     return torch.from_numpy(np.where(missing, guess, depth))
 
 
-def refuted(means: torch.Tensor, keyframe: Keyframe, behind: float) -> PerGaussianFlag:
+def _refuted(means: torch.Tensor, keyframe: Keyframe, behind: float) -> PerGaussianFlag:
     """Which centres [n, 3] in the map frame a keyframe has looked through: it has a reading well behind them."""
     camera, depth = keyframe.frame.camera, keyframe.frame.depth
     points = se3.transform(se3.inverse(keyframe.T_map_cam), means)

@@ -29,35 +29,50 @@ class Fields:
             values: Of each point, to be summed.
             cell: Edge of a cell, metres.
         """
-        corners = [_corners(some, cell) for some in points]
-        keys = np.unique(np.concatenate([np.unique(key) for key, _ in corners]))
-        self._spread = [_matrix(np.searchsorted(keys, key), weight, len(keys)) for key, weight in corners]
-        self._filled, self._sums = [], []
-        for spread, some in zip(self._spread, values, strict=True):
-            cells = np.unique(spread.indices)
-            self._filled.append(cells)
-            self._sums.append((spread.T @ some)[cells])
-        self._columns = [self._of_channel(channel, len(keys)) for channel in range(values[0].shape[1])]
+        self._cell = cell
+        self._filled = [np.unique(_corners(some, cell)[0]) for some in points]
+        self._keys = np.unique(np.concatenate(self._filled))
+        self._filled = [np.searchsorted(self._keys, filled) for filled in self._filled]
+        spread = zip(points, values, self._filled, strict=True)
+        self._sums = [(self._weights(some).T @ value)[filled] for some, value, filled in spread]
+        self._columns = [self._of_channel(channel) for channel in range(values[0].shape[1])]
 
     def __len__(self) -> int:
-        return len(self._spread)
+        return len(self._filled)
 
-    def at_points_of(self, submap: int) -> Float[np.ndarray, "n s c"]:
-        """All fields at the points of one submap: of each point, by submap, by channel."""
-        spread = self._spread[submap]
-        return np.stack([(spread @ column).toarray() for column in self._columns], axis=-1)
+    def near(self, points: Points) -> tuple[Int[np.ndarray, " s"], Float[np.ndarray, "n s c"]]:
+        """The submaps with something about some of these points, and what: of each point, by submap, by channel.
+
+        Points must be among those that were spread.
+        """
+        weights = self._weights(points)
+        submaps = np.unique((weights @ self._columns[0]).indices)
+        return submaps, np.stack([(weights @ column[:, submaps]).toarray() for column in self._columns], axis=-1)
+
+    def overlaps(self, fewest: int) -> list[tuple[int, int]]:
+        """Pairs of submaps that have spread something to at least so many of the same corners, the earlier first."""
+        filled = self._columns[0].copy()
+        filled.data[:] = 1.0
+        shared = sp.triu(filled.T @ filled, k=1).tocoo()
+        return [(int(a), int(b)) for a, b, n in zip(shared.row, shared.col, shared.data, strict=True) if n >= fewest]
 
     def shared(self, a: int, b: int) -> tuple[Float[np.ndarray, "m c"], Float[np.ndarray, "m c"]]:
         """The sums of two submaps at the corners that both have spread something to."""
         _, in_a, in_b = np.intersect1d(self._filled[a], self._filled[b], assume_unique=True, return_indices=True)
         return self._sums[a][in_a], self._sums[b][in_b]
 
-    def _of_channel(self, channel: int, corners: int) -> sp.csr_matrix:
+    def _weights(self, points: Points) -> sp.csr_matrix:
+        """Points by corners."""
+        keys, weights = _corners(points, self._cell)
+        columns, starts = np.searchsorted(self._keys, keys), np.arange(0, keys.size + 1, len(_CORNERS))
+        return sp.csr_matrix((weights.ravel(), columns.ravel(), starts), shape=(len(points), len(self._keys)))
+
+    def _of_channel(self, channel: int) -> sp.csr_matrix:
         """Corners by submaps."""
         rows = np.concatenate(self._filled)
-        columns = np.repeat(np.arange(len(self)), [len(cells) for cells in self._filled])
+        columns = np.repeat(np.arange(len(self)), [len(filled) for filled in self._filled])
         sums = np.concatenate([some[:, channel] for some in self._sums])
-        return sp.csr_matrix((sums, (rows, columns)), shape=(corners, len(self)))
+        return sp.csr_matrix((sums, (rows, columns)), shape=(len(self._keys), len(self)))
 
 
 def _corners(points: Points, cell: float) -> tuple[Int[np.ndarray, "n 8"], Float[np.ndarray, "n 8"]]:
@@ -68,9 +83,3 @@ def _corners(points: Points, cell: float) -> tuple[Int[np.ndarray, "n 8"], Float
     weights = np.where(_CORNERS == 1, share, 1.0 - share).prod(axis=-1)
     x, y, z = np.moveaxis(low.astype(np.int64)[:, None] + _CORNERS + (1 << (_BITS - 1)), -1, 0)
     return x << (2 * _BITS) | y << _BITS | z, weights
-
-
-def _matrix(columns: Int[np.ndarray, "n 8"], weights: Float[np.ndarray, "n 8"], corners: int) -> sp.csr_matrix:
-    """Points by corners."""
-    starts = np.arange(0, columns.size + 1, columns.shape[1])
-    return sp.csr_matrix((weights.ravel(), columns.ravel(), starts), shape=(len(columns), corners))

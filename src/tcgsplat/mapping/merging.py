@@ -8,6 +8,7 @@ decided by fields over the world (`mapping.fields`), blurred by centimetres so t
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from typing import TypeVar, overload
 
 import numpy as np
@@ -19,7 +20,6 @@ from tcgsplat.confidence import equations as eq
 from tcgsplat.confidence.state import ConfidenceState
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.brightness import exposures_of
-from tcgsplat.mapping.completion import refuted
 from tcgsplat.mapping.fields import Fields
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.protocol import NEAR_PLANE, Rasterizer
@@ -27,7 +27,7 @@ from tcgsplat.render.view import SubmapView
 from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.gaussians import SH_C0, Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
-from tcgsplat.tensors import Mask, PerGaussianFlag, Pose
+from tcgsplat.tensors import PerGaussian, PerGaussianFlag, Pose
 
 Table = TypeVar("Table", Gaussians, ConfidenceState)
 
@@ -38,6 +38,10 @@ _CHALLENGE = 1.1
 surface lies where the field of its own submap is a little greater: without this, equals would all be kept."""
 _BLENDED = 0.1
 """Of the colour range: where submaps differ by more, they do not show the same surface."""
+_AGAINST = 2
+"""So many keyframes must have looked through a Gaussian for each that has seen it: sensors see edges where none are."""
+_SAMPLED = 64
+"""One in so many Gaussians tells whether a keyframe sees a submap at all."""
 _NOTHING = 1e-6
 """Summed confidence of a place where a submap has nothing."""
 
@@ -101,14 +105,15 @@ def merged(submaps: Iterable[Submap], config: MapperConfig, rasterizer: Rasteriz
     """One map from the sealed submaps of a run, standing where their `T_world_map` has them.
 
     Of the copies of a surface that one is kept whose submap is the most confident there and has sampled it most finely:
-    whose field of summed confidence is the greatest. Where what is kept leaves a view of a keyframe open, Gaussians of
-    its own submap come back. Guesses (negative ids) are kept where a view would be open without them and no keyframe of
-    any submap has looked through them. Confidence rows follow their Gaussians; `born` goes on counting from submap to
+    whose field of summed confidence is the greatest. What keyframes of other submaps have looked through goes, unless
+    about as many have seen a surface there. Where what is kept leaves a view of a keyframe open, Gaussians of its own
+    submap come back. Guesses (negative ids) are kept where a view would be open without them and no keyframe of another
+    submap has looked through them. Confidence rows follow their Gaussians; `born` goes on counting from submap to
     submap. Nothing is random.
 
     Args:
         submaps: In the order of the run. Their keyframes are kept, and looked at more than once.
-        config: When a pixel is open, and how far behind a guess a reading must lie to refute it.
+        config: When a pixel is open, and how far behind a Gaussian a reading must lie to have looked through it.
         rasterizer: Backend.
     """
     parts: list[Submap] = []
@@ -118,11 +123,8 @@ def merged(submaps: Iterable[Submap], config: MapperConfig, rasterizer: Rasteriz
         return Merged(Submap.anchored(se3.identity(), index=0, sh_degree=config.sh_degree), (), ())
     about = Fields([part.gaussians.means.numpy() for part in parts], [_shown(part) for part in parts], _CELL)
     exposures = exposures_of(about)
-    kept, blended = [], []
-    for index, part in enumerate(parts):
-        fields_here = about.at_points_of(index)
-        kept.append(torch.from_numpy(_owner(fields_here[..., 0]) == index) & ~_guessed(part))
-        blended.append(_blended(part.gaussians, fields_here, index, exposures))
+    placed = [_kept_and_blended(part, index, about, exposures) for index, part in enumerate(parts)]
+    kept, blended = zip(*placed, strict=True)
     keyframes = WorldKeyframes([p.keyframes for p in parts], [p.T_world_map for p in parts], exposures)
     everything = Submap(
         index=0,
@@ -132,12 +134,12 @@ def merged(submaps: Iterable[Submap], config: MapperConfig, rasterizer: Rasteriz
         keyframes=keyframes,
         clock=sum(part.clock for part in parts),
     )
+    rows = _rows([len(part) for part in parts])
     keep, guessed = torch.cat(kept), _guessed(everything)
-    keep = _closed(everything, keep, ~guessed, [len(part) for part in parts], keyframes, config, rasterizer)
-    for keyframe in keyframes:
-        behind = config.seeding.behind
-        guessed[guessed.clone()] = ~refuted(everything.gaussians.means[guessed], keyframe, behind)
-    keep = _closed(everything, keep, guessed, [len(part) for part in parts], keyframes, config, rasterizer)
+    through, seen = _witnesses(everything.gaussians.means, keep | guessed, rows, keyframes, config.seeding.behind)
+    keep &= through <= _AGAINST * seen
+    keep = _closed(everything, keep, ~guessed & (through == 0), rows, keyframes, config, rasterizer)
+    keep = _closed(everything, keep, guessed & (through == 0), rows, keyframes, config, rasterizer)
     return Merged(everything.kept(keep), tuple(part.T_world_map for part in parts), exposures)
 
 
@@ -175,54 +177,86 @@ def _owner(confidence: Float[np.ndarray, "n s"]) -> Int[np.ndarray, " n"]:
     return owner
 
 
-def _blended(
-    gaussians: Gaussians, about: Float[np.ndarray, "n s 4"], index: int, exposures: Sequence[Exposure]
-) -> Gaussians:
-    """A submap's Gaussians as bright as the map, and in the large as all submaps together show the place."""
-    gains, offsets = (np.array([getattr(e, name) for e in exposures])[:, None] for name in ("gain", "offset"))
-    weight = about[..., :1]
-    shown = about[..., 1:] * gains + weight * offsets
-    own = shown[:, index] / np.maximum(weight[:, index], _NOTHING)
-    everyone = shown.sum(axis=1) / np.maximum(weight.sum(axis=1), _NOTHING)
-    apart = np.where(weight[:, index] > _NOTHING, everyone - own, 0.0)
-    change = torch.from_numpy(apart / (1.0 + (np.abs(apart) / _BLENDED) ** 4)).to(gaussians.sh)
-    exposure = exposures[index]
-    sh = exposure.gain * gaussians.sh
-    sh[:, 0] = (exposure.gain * _colors(gaussians) + exposure.offset + change - 0.5) / SH_C0
-    return replace(gaussians, sh=sh)
+def _kept_and_blended(
+    part: Submap, index: int, about: Fields, exposures: Sequence[Exposure]
+) -> tuple[PerGaussianFlag, Gaussians]:
+    """Which of a submap's Gaussians are where it is the owner, and all of them as the map paints the place."""
+    if not len(part):
+        return _guessed(part), part.gaussians
+    submaps, here = about.near(part.gaussians.means.numpy())
+    mine = torch.from_numpy(submaps[_owner(here[..., 0])] == index)
+    weight, color = here[..., :1], here[..., 1:]
+    gains, offsets = (np.array([getattr(exposures[i], name) for i in submaps])[:, None] for name in ("gain", "offset"))
+    color = gains * color + offsets * weight
+    own, everyone = (
+        some.sum(axis=1) / np.maximum(total.sum(axis=1), _NOTHING)
+        for some, total in ((color[:, submaps == index], weight[:, submaps == index]), (color, weight))
+    )
+    apart = np.where(weight[:, submaps == index].sum(axis=1) > _NOTHING, everyone - own, 0.0)
+    change = torch.from_numpy(apart / (1.0 + (np.abs(apart) / _BLENDED) ** 4)).to(part.gaussians.sh)
+    exposure, sh = exposures[index], exposures[index].gain * part.gaussians.sh
+    sh[:, 0] = (exposure.gain * _colors(part.gaussians) + exposure.offset + change - 0.5) / SH_C0
+    return mine & ~_guessed(part), replace(part.gaussians, sh=sh)
+
+
+def _rows(sizes: Sequence[int]) -> list[slice]:
+    """Of each submap in the table of all."""
+    ends = np.cumsum([0, *sizes]).tolist()
+    return [slice(first, last) for first, last in pairwise(ends)]
+
+
+def _witnesses(
+    means: Float[Tensor, "n 3"], asked: PerGaussianFlag, rows: Sequence[slice], keyframes: WorldKeyframes, behind: float
+) -> tuple[Int[Tensor, " n"], Int[Tensor, " n"]]:
+    """How many keyframes of other submaps have looked through each Gaussian, and how many of all have seen it there."""
+    through, seen = (torch.zeros(len(means), dtype=torch.int64) for _ in range(2))
+    asked_of = [asked[some].nonzero().flatten() + some.start for some in rows]
+    for witness in range(len(rows)):
+        for keyframe in keyframes.of_submap(witness):
+            for index, some in enumerate(asked_of):
+                if not bool(_projected(means[some[::_SAMPLED]], keyframe)[2].any()):
+                    continue
+                z, pixels, inside = _projected(means[some], keyframe)
+                reading = eq.sample_at(keyframe.frame.depth, pixels)
+                tolerance = behind * (0.5 + 0.1 * z.square())  # a sensor's noise grows with the square of depth
+                seen[some] += inside & (reading > 0) & ((reading - z).abs() <= tolerance)
+                if index != witness:
+                    through[some] += inside & (reading - z > tolerance)
+    return through, seen
 
 
 def _closed(
     everything: Submap,
     keep: PerGaussianFlag,
     candidates: PerGaussianFlag,
-    sizes: Sequence[int],
+    rows: Sequence[slice],
     keyframes: WorldKeyframes,
     config: MapperConfig,
     rasterizer: Rasterizer,
 ) -> PerGaussianFlag:
     """What to keep, and of the candidates those that their submap's keyframes see where nothing closes the view."""
-    keep, means, first = keep.clone(), everything.gaussians.means, 0
-    for index, size in enumerate(sizes):
-        rows = slice(first, first + size)
-        first += size
-        missing = candidates[rows] & ~keep[rows]
+    keep, means = keep.clone(), everything.gaussians.means
+    for index, some in enumerate(rows):
+        missing = candidates[some] & ~keep[some]
         if not bool(missing.any()):
             continue
         view, needed = SubmapView(everything.kept(keep), rasterizer), torch.zeros_like(missing)
         for keyframe in keyframes.of_submap(index):
             alpha = view(keyframe.frame.camera, keyframe.T_map_cam).alpha
-            needed |= _open(means[rows], keyframe, alpha < config.seeding.min_alpha)
-        keep[rows] |= missing & needed
+            _, pixels, inside = _projected(means[some], keyframe)
+            needed |= inside & (eq.sample_at(alpha, pixels) < config.seeding.min_alpha)
+        keep[some] |= missing & needed
     return keep
 
 
-def _open(means: Float[Tensor, "n 3"], keyframe: Keyframe, where: Mask) -> PerGaussianFlag:
-    """Which centres a keyframe sees at flagged pixels."""
+def _projected(
+    means: Float[Tensor, "n 3"], keyframe: Keyframe
+) -> tuple[PerGaussian, Float[Tensor, "n 2"], PerGaussianFlag]:
+    """Depth (metres) and pixel of each centre in a keyframe, and whether it is in the picture."""
     camera, points = keyframe.frame.camera, se3.transform(se3.inverse(keyframe.T_map_cam), means)
     in_front = points[:, 2] > NEAR_PLANE
     pixels = camera.project(torch.where(in_front[:, None], points, 1.0))
-    return in_front & camera.contains(pixels) & (eq.sample_at(where.to(means.dtype), pixels) > 0)
+    return points[:, 2], pixels, in_front & camera.contains(pixels)
 
 
 def _joined(kind: type[Table], parts: Sequence[Table]) -> Table:
