@@ -1,10 +1,15 @@
 """`tcgsplat localize`: pictures are found where they were taken, or not at all; and whoever gives others is told."""
 
+import importlib.util
+import json
+import math
 import re
 import shutil
 import signal
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -256,3 +261,51 @@ def test_a_wrong_picture_is_told_before_any_frame_is_given(world: World, tmp_pat
     assert cv2.imwrite(str(tmp_path / "small.png"), np.zeros((60, 80, 3), np.uint8))
     with pytest.raises(DatasetError, match=r"small\.png is 80x60 and"):
         frames_of(RunDirectory.open(world.run), [world.color(4), tmp_path / "small.png"], 0, 1, None)
+
+
+# benchmarks/localization.py.
+
+
+def script() -> ModuleType:
+    path = Path(__file__).parents[2] / "benchmarks" / "localization.py"
+    spec = importlib.util.spec_from_file_location("localization", path)
+    module = sys.modules["localization"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_benchmark_counts_what_is_near_and_what_is_wrong(
+    world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    localization = script()
+    shutil.copytree(world.run, tmp_path / "room")  # a run that is there is not made again
+    elsewhere = recorded(tmp_path / "elsewhere", PatternedRoom(seed=1), path()[:2])
+    out = tmp_path / "figures.json"
+    args = localization.Args((world.room,), (elsewhere,), tmp_path, every=4, strangers_every=1, json=out)
+    assert localization.main(args) == 0
+    lines = json.loads(out.read_text())["lines"]
+    assert [line["pictures"] for line in lines] == [
+        "between, with depth", "between, bare", "elsewhere, with depth", "elsewhere, bare",
+    ]  # fmt: skip
+    assert [(line["looked_up"], len(line["found"]), line["near"], line["wrong"]) for line in lines] == [
+        (2, 2, 100.0, 0), (2, 2, 100.0, 0), (2, 0, 0.0, 0), (2, 0, 0.0, 0),
+    ]  # fmt: skip
+    assert [one["frame"] for one in lines[0]["found"]] == [1, 9]
+    assert all(0 < one["centimeters"] < 2 and 0 < one["degrees"] < 1 for one in lines[0]["found"])
+    assert capsys.readouterr().out.splitlines()[-1].split() == ["room", "elsewhere,", "bare", "2", "0", "0.0", "-", "0"]
+
+    found = [
+        localization.Lookup(1, 0, *error) for error in ((1, 0.5), (3, 0.5), (1, 2), (6, 0), (0, 4), (math.nan,) * 2)
+    ]
+    line = localization.Line("map", "pictures", 10, tuple(found))
+    assert line.near == 10.0
+    assert line.wrong == found[3:]
+
+
+def test_errors_are_in_the_frame_of_the_truth():
+    localization = script()
+    T_truth_world, truth, off = pose(1.0, degrees=(0, 90, 0)), pose(0, 2.0), pose(0.03, degrees=(0, 0, 2))
+    seen = (4, se3.inverse(T_truth_world) @ truth @ off)
+    found = localization.lookup(7, seen, T_truth_world, truth)
+    assert (found.frame, found.submap) == (7, 4)
+    assert (found.centimeters, found.degrees) == pytest.approx((3.0, 2.0), abs=0.01)
