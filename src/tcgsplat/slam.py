@@ -299,24 +299,20 @@ class Slam:
         self.atlas = self.atlas.with_submap(self.submap.T_world_map)
         self.motion = self.motion.rebased()
         self._reference = Reference(reference, se3.inverse(tracked.T_map_cam), tracked.exposure)
-        # What a live system has found out is not waited for, so there is no moment at which all of it is known.
-        checkpoint = (
-            None
-            if self._live
-            else Checkpoint(
-                frame_index=frame_index,
-                sealed=index,
-                trajectory=self.trajectory,
-                atlas=self.atlas,
-                edges=(*self._closer.edges, edge),
-                motion=self.motion,
-                delay=self.delay,
-                reference=reference.index,
-                T_map_reference=self._reference.T_map_reference,
-                exposure=self._reference.exposure,
-                next_id=self._ids.next,
-                generator=self._generator.get_state(),
-            )
+        checkpoint = Checkpoint(
+            frame_index=frame_index,
+            sealed=index,
+            trajectory=self.trajectory,
+            atlas=self.atlas,
+            edges=(*self._closer.edges, edge),
+            motion=self.motion,
+            delay=self.delay,
+            reference=reference.index,
+            T_map_reference=self._reference.T_map_reference,
+            exposure=self._reference.exposure,
+            next_id=self._ids.next,
+            generator=self._generator.get_state(),
+            exact=not self._live,
         )
         self._keeping.append(self._keeping_thread.submit(self._kept, sealed, checkpoint, edge))
         self._since_sealed = 0

@@ -276,6 +276,14 @@ def test_the_last_submap_leaves_the_checkpoint_as_it_is(tmp_path: Path, generato
     assert (run.path / "checkpoint.npz").read_bytes() == before
 
 
+def test_a_live_run_tells_its_path_and_cannot_be_gone_on_with(tmp_path: Path, generator: torch.Generator):
+    run = RunDirectory.create(tmp_path / "live", config_toml="", sequence="")
+    state = dataclasses.replace(random_checkpoint(generator, sealed=1), exact=False)
+    run.keep(Submap.anchored(se3.identity(), index=0), state)
+    assert bits(run.trajectory()[0].rows) == bits(state.trajectory.rows)
+    assert run.checkpoint() is None
+
+
 def test_a_submap_that_the_checkpoint_knows_and_is_gone_is_told(tmp_path: Path, generator: torch.Generator):
     run = kept(tmp_path / "run", generator, 3)
     (run.path / "submaps" / "0001.npz").unlink()

@@ -49,6 +49,9 @@ class Checkpoint:
     """Of Gaussians."""
     generator: UInt8[Tensor, " bytes"] = field(repr=False)
     """State of the one random generator."""
+    exact: bool = True
+    """Nothing was under way; false in a live system, which does not wait for what it is finding out. One that is not
+    exact tells the path so far, and nobody can go on from it."""
 
 
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:

@@ -108,6 +108,7 @@ class RunDirectory:
         self.write_submap(submap)
         if checkpoint is not None:
             self.write_trajectory(checkpoint.trajectory, checkpoint.atlas)
+        if checkpoint is not None and checkpoint.exact:
             write_checkpoint(self.path / "checkpoint.npz", checkpoint)
 
     def checkpoint(self) -> Checkpoint | None:
