@@ -7,7 +7,7 @@ What is no picture of the place must not be found at all. Runs are kept, and use
 import json
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -144,6 +144,7 @@ def measured(folder: Path, args: Args, rasterizer: Rasterizer) -> Iterable[Line]
     """
     run = mapped(folder, args.out / folder.name, rasterizer)
     known, T_truth_world = relocalizer(run, rasterizer), alignment(run, folder)
+    T_world_map = run.trajectory()[1].T_world_map
     between = open_sequence(folder, start=1, stride=2 * args.every)
     truth = between.ground_truth()
     indices = {i: 1 + 2 * args.every * i for i in range(len(between))}
@@ -152,7 +153,7 @@ def measured(folder: Path, args: Args, rasterizer: Rasterizer) -> Iterable[Line]
             found = []
             for frame in between:
                 tell(frame.index, len(between))
-                seen = located(known, frame, bare)
+                seen = located(known, T_world_map, frame, bare)
                 if seen is not None and frame.index in truth:
                     found.append(lookup(indices[frame.index], seen, T_truth_world, truth[frame.index]))
         yield Line(run.path.name, what, len(truth), tuple(found))
@@ -163,7 +164,7 @@ def measured(folder: Path, args: Args, rasterizer: Rasterizer) -> Iterable[Line]
                 found = []
                 for frame in strange:
                     tell(frame.index, len(strange))
-                    seen = located(known, frame, bare)
+                    seen = located(known, T_world_map, frame, bare)
                     if seen is not None:
                         found.append(Lookup(frame.index * args.strangers_every, seen[0], math.nan, math.nan))
             yield Line(run.path.name, f"{place.name}, {what}", len(strange), tuple(found))
@@ -192,10 +193,13 @@ def alignment(run: RunDirectory, folder: Path) -> Pose:
     return T
 
 
-def located(known: Relocalizer, frame: Frame, bare: bool) -> tuple[int, Pose] | None:
+def located(known: Relocalizer, T_world_map: Sequence[Pose], frame: Frame, bare: bool) -> tuple[int, Pose] | None:
     """The submap in which a picture was found, and its pose in the run's world."""
-    found = known.relocalized(replace(frame, depth=torch.zeros_like(frame.depth)) if bare else frame)
-    return None if found is None else (found.reference.index, found.reference.T_world_map @ found.tracked.T_map_cam)
+    found = known.relocalized(replace(frame, depth=torch.zeros_like(frame.depth)) if bare else frame, T_world_map)
+    if found is None:
+        return None
+    index = found.reference.index
+    return index, T_world_map[index] @ found.tracked.T_map_cam
 
 
 def lookup(index: int, seen: tuple[int, Pose], T_truth_world: Pose, truth: Pose) -> Lookup:

@@ -10,6 +10,7 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +27,6 @@ from tcgsplat.datasets.synthetic.writer import sequence_files
 from tcgsplat.errors import DatasetError
 from tcgsplat.geometry import se3
 from tcgsplat.loop.relocalization import Relocalizer
-from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.trajectory import parse_tum
 from tcgsplat.storage.run_directory import RunDirectory
 from tcgsplat.tensors import Pose
@@ -231,9 +231,9 @@ def test_ctrl_c_saves_what_is_found(
 ):
     look_up = Relocalizer.relocalized
 
-    def interrupted(self: Relocalizer, frame: Frame) -> object:
+    def interrupted(self: Relocalizer, *picture: Any) -> object:
         signal.raise_signal(signal.SIGINT)
-        return look_up(self, frame)
+        return look_up(self, *picture)
 
     monkeypatch.setattr(Relocalizer, "relocalized", interrupted)
     assert main(["localize", str(world.run), str(world.room), "--out", str(tmp_path / "poses.txt")]) == 130

@@ -19,7 +19,7 @@ from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory, parse_tum
 from tcgsplat.storage import archive
-from tcgsplat.storage.run_directory import RunDirectory
+from tcgsplat.storage.run_directory import RunDirectory, is_free
 
 CAMERA = Camera(fx=31.7, fy=32.3, cx=15.1, cy=11.2, width=32, height=24)
 
@@ -236,6 +236,16 @@ def test_trajectory_of_an_older_run_names_no_mapped_frame(tmp_path: Path, genera
     read, _ = run.trajectory()
     assert [row.mapped for row in read.rows] == [False, False]
     assert torch.equal(read.rows[1].T_map_cam, rows[1].T_map_cam)
+
+
+def test_a_run_that_was_killed_before_it_was_one_leaves_its_folder_free(tmp_path: Path) -> None:
+    (tmp_path / "submaps").mkdir()
+    (tmp_path / "config.toml").write_text("")
+    (tmp_path / ".run.json.12.partial").write_text("{")
+    assert is_free(tmp_path) and is_free(tmp_path / "nothing")
+    RunDirectory.create(tmp_path, config_toml="", sequence="")
+    assert not is_free(tmp_path)
+    assert not is_free(tmp_path / "run.json"), "a file"
 
 
 def test_closure_moves_submaps_through_the_trajectory_alone(tmp_path: Path, generator: torch.Generator) -> None:

@@ -65,16 +65,16 @@ def command(args: Args) -> int:
     torch.set_num_threads(1)  # as in a run: the kernels have threads of their own
     config = from_toml(run.config_toml)
     compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
-    known = relocalizer(run, rasterizer)
+    known, (_, atlas) = relocalizer(run, rasterizer), run.trajectory()
     stamps, poses, total = [], [], 0
     with stopping_on_interrupt() as stop:
         for name, frame in frames:
             total += 1
-            found = known.relocalized(frame)
+            found = known.relocalized(frame, atlas.T_world_map)
             if found is None:
                 sys.stdout.write(f"{name}: not found\n")
             else:
-                T_world_cam = found.reference.T_world_map @ found.tracked.T_map_cam
+                T_world_cam = atlas.T_world_map[found.reference.index] @ found.tracked.T_map_cam
                 x, y, z = T_world_cam[:3, 3].tolist()
                 sys.stdout.write(f"{name}: {x:.3f} {y:.3f} {z:.3f} m, in submap {found.reference.index}\n")
                 stamps.append(frame.timestamp)

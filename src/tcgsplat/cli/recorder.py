@@ -25,7 +25,7 @@ from tcgsplat.errors import ArchiveError
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.slam import Slam, StepReport
 from tcgsplat.storage import atomic
-from tcgsplat.storage.run_directory import RunDirectory
+from tcgsplat.storage.run_directory import RunDirectory, is_free
 
 logger = logging.getLogger(__name__)
 
@@ -86,6 +86,8 @@ def resume(path: Path, config: SlamConfig, folder: Path, part: Part) -> RunDirec
     other = [f"{name} was {then[name]} and is {now[name]}" for name in now if now[name] != then[name]]
     if other:
         raise ArchiveError(f"the run in {path} has other settings: {'; '.join(other)}; resume it with the same ones")
+    for outdated in ("summary.json", "map.npz", "report.json", "localized.txt"):
+        (path / outdated).unlink(missing_ok=True)
     return run
 
 
@@ -95,7 +97,7 @@ def begin(path: Path, config: SlamConfig, folder: Path, part: Part, *, overwrite
     Raises:
         ArchiveError: if there is something at `path` already that may not be, or cannot be, replaced.
     """
-    if path.exists() and any(path.iterdir() if path.is_dir() else [path]):
+    if not is_free(path):
         if not overwrite:
             raise ArchiveError(f"{path} exists; choose another folder by --out, or replace the run by --overwrite")
         shutil.rmtree(RunDirectory.open(path).path)  # `open` refuses a folder that holds no run

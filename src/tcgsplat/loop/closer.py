@@ -128,5 +128,5 @@ class LoopCloser:
         return Side(submap, places[submap.index], places.viewpoints(submap.index, similarity, self._config, floor))
 
     def relocalized(self, frame: Frame, active: Submap) -> Relocalized | None:
-        """Where a lost camera is, if the place is known: in the active submap rather than in another one."""
-        return self._relocalizer.relocalized(frame, active)
+        """Where a lost camera is, if the place is known: in the active submap or in another one."""
+        return self._relocalizer.relocalized(frame, self.T_world_map, active)

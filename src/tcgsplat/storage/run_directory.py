@@ -52,7 +52,7 @@ class RunDirectory:
         Raises:
             ArchiveError: if there is something at `path` already, or the folder cannot be made.
         """
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        if not is_free(path):
             raise ArchiveError(f"{path} exists and is not an empty folder; choose another one for the run or delete it")
         try:
             (path / "submaps").mkdir(parents=True, exist_ok=True)
@@ -222,6 +222,14 @@ def _standing(submap: Submap, atlas: Atlas) -> Submap:
     """Where the atlas has it, if it does."""
     known = submap.index < len(atlas)
     return replace(submap, T_world_map=atlas.T_world_map[submap.index]) if known else submap
+
+
+def is_free(path: Path) -> bool:
+    """Whether a run can begin there: nothing is, or no more than is left of a run that was killed before it was one."""
+    if not path.is_dir():
+        return not path.exists()
+    names = {entry.name for entry in path.iterdir() if not entry.name.startswith(".")}
+    return names <= {"submaps", "config.toml"} and not any((path / "submaps").glob("*"))
 
 
 def _read_json(path: Path, complaint: str) -> dict[str, object]:
