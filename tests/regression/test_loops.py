@@ -265,6 +265,7 @@ def carried(back: Sequence[Pose], *, room: PatternedRoom | None = None) -> tuple
 
 
 BACK = walk([0, *[6 + 2 * i for i in range(20)]])[1:]
+AHEAD = walk([0, *[160 - 2 * i for i in range(12)]])[1:]
 
 
 def assert_right(result: Run, truth: Sequence[Pose], millimetres: float) -> None:
@@ -329,9 +330,9 @@ class TestLost:
         assert all(row.lost for row in result.slam.trajectory.rows[40:])
 
     def test_in_the_submap_that_is_growing_no_new_one_begins(self, rasterizer: Rasterizer) -> None:
-        """Uncovered where the active submap looks, but farther than tracking reaches."""
+        """Uncovered where only the active submap looks, and farther than tracking reaches."""
         config = replace(CONFIG, schedule=replace(CONFIG.schedule, submap_by="motion", submap_angle=80.0))
-        frames, T = carried(walk([0, *[60 + 2 * i for i in range(12)]])[1:])
+        frames, T = carried(AHEAD)
         result = run(frames, rasterizer, config)
         (report,) = [report for report in result.reports if report.found]
         assert report.found is not None
@@ -341,7 +342,7 @@ class TestLost:
 
     def test_in_the_submap_that_is_growing_where_the_next_one_is_due(self, rasterizer: Rasterizer) -> None:
         """The next one hangs on it as it is kept; a run that goes on from there has the same to track against."""
-        frames, T = carried(walk([0, *[82 + 2 * i for i in range(10)]])[1:])
+        frames, T = carried(AHEAD)
         result = run(frames, rasterizer)
         (report,) = [report for report in result.reports if report.found]
         assert report.found is not None
