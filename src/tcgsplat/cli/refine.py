@@ -24,7 +24,7 @@ class Args:
     run: tyro.conf.Positional[Path]
     """The run directory."""
     seconds: float = 60.0
-    """Of optimising; merging, which takes some seconds, comes on top."""
+    """Of optimising; merging, which takes about a second for every ten keyframes, comes on top."""
     steps: int | None = None
     """So many optimisation steps a keyframe, instead of a time."""
     backend: str = "auto"
@@ -51,6 +51,7 @@ def command(args: Args) -> int:
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     torch.set_num_threads(1)  # as in a run: the kernels have threads of their own
     compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
+    say(f"merging {run.submap_count} submaps")
     merged = newly_merged(run, rasterizer)
     sys.stdout.write(f"{len(merged.T_world_map)} submaps merged: {len(merged.submap)} Gaussians\n")
     sys.stdout.flush()
