@@ -81,6 +81,7 @@ class LoopCloser:
     def restore(self, T_world_map: Sequence[Pose], edges: Sequence[Edge]) -> None:
         """Know again what was known when the last of these submaps began."""
         self.T_world_map, self.edges = tuple(T_world_map), tuple(edges)
+        self.rejected = tuple(self.edges[i] for i in solved(self.T_world_map, self.edges).rejected)
         for index in range(len(T_world_map) - 1):
             self._relocalizer.remember(self._load(index))
 

@@ -1,5 +1,6 @@
 """Where a picture stands in a map that was not made of it, and whether to believe it."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -83,8 +84,9 @@ class Localizer:
         """What speaks against a pose; empty if nothing does."""
         config = self._config
         moved = se3.inverse(first.T_map_cam) @ second.T_map_cam
-        if se3.translation_norm(moved) > _SETTLED_METERS or se3.rotation_angle(moved) > _SETTLED_RADIANS:
-            return f"its pose is not settled: it moved on by {1e3 * se3.translation_norm(moved):.0f} mm"
+        step, turn = se3.translation_norm(moved), se3.rotation_angle(moved)
+        if step > _SETTLED_METERS or turn > _SETTLED_RADIANS:
+            return f"its pose is not settled: it moved on by {1e3 * step:.0f} mm and {math.degrees(turn):.1f} degrees"
         if not coverage >= config.min_coverage:  # NaN, too
             return f"the map covers only {100 * coverage:.0f} % of it"
         if second.agreement < config.min_agreement:

@@ -59,6 +59,8 @@ class Place:
 
     def overlap(self, other: "Place", T_other_this: Pose) -> float:
         """Share of what this place has measured that is in the view of another one, if they stand so."""
+        if not self.views:
+            return 0.0
         parts = [view.features.measured.moved(view.T_map_cam).points[:_SAMPLED] for view in self.views]
         points = se3.transform(T_other_this, torch.from_numpy(np.concatenate(parts)).to(torch.float64))
         seen = torch.zeros(len(points), dtype=torch.bool)

@@ -75,6 +75,8 @@ class Relocalizer:
         if not passed:
             return None
         best = max(passed, key=lambda one: one.tracked.correlation)
+        growing = [one for one in passed if one.reference is active and _together(one, best, T_world_map)]
+        best = growing[0] if growing else best  # rather than begin a new submap where another one looks a little better
         clear = best.tracked.correlation - _CLEARLY
         rivals = [one for one in passed if one.tracked.correlation > clear]
         return best if all(_together(best, rival, T_world_map) for rival in rivals) else None
