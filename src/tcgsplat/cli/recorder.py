@@ -24,7 +24,6 @@ from tcgsplat.datasets.playback import Arrival, Clock, in_turn, play
 from tcgsplat.errors import ArchiveError
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.slam import Slam, StepReport
-from tcgsplat.storage import atomic
 from tcgsplat.storage.run_directory import RunDirectory, is_free
 
 logger = logging.getLogger(__name__)
@@ -49,10 +48,10 @@ class Part:
         """
         return open_sequence(folder, start=self.start, stride=self.stride, limit=self.limit)
 
-    def write(self, run: RunDirectory) -> None:
-        """Put it into the run directory as `request.json`, with the command line for people."""
-        request = {"command": shlex.join(["tcgsplat", *sys.argv[1:]]), **asdict(self)}
-        atomic.write_text(run.path / "request.json", json.dumps(request, indent=2) + "\n")
+    @property
+    def request(self) -> str:
+        """As `request.json` has it, with the command line for people."""
+        return json.dumps({"command": shlex.join(["tcgsplat", *sys.argv[1:]]), **asdict(self)}, indent=2) + "\n"
 
     @staticmethod
     def of(run: RunDirectory) -> "Part":
@@ -101,9 +100,8 @@ def begin(path: Path, config: SlamConfig, folder: Path, part: Part, *, overwrite
         if not overwrite:
             raise ArchiveError(f"{path} exists; choose another folder by --out, or replace the run by --overwrite")
         shutil.rmtree(RunDirectory.open(path).path)  # `open` refuses a folder that holds no run
-    run = RunDirectory.create(path, config_toml=to_toml(config), sequence=str(folder.expanduser().resolve()))
-    part.write(run)
-    return run
+    data = str(folder.expanduser().resolve())
+    return RunDirectory.create(path, config_toml=to_toml(config), sequence=data, request=part.request)
 
 
 def recorded(

@@ -2,6 +2,7 @@
 
     RUN/
       run.json           what this folder is: {"kind": "run", "version": 1, "sequence": path of the data}
+      request.json       which part of the data was asked for, and the command
       config.toml        the resolved settings
       submaps/0000.npz   one sealed submap each, with its keyframes (see `archive`)
       checkpoint.npz     what `run --resume` goes on from: the state after the last of these submaps
@@ -41,13 +42,14 @@ class RunDirectory:
     path: Path
 
     @staticmethod
-    def create(path: Path, *, config_toml: str, sequence: str) -> "RunDirectory":
+    def create(path: Path, *, config_toml: str, sequence: str, request: str | None = None) -> "RunDirectory":
         """Begin a run in a new or empty folder.
 
         Args:
             path: The folder; its parents are made if need be.
             config_toml: The resolved settings, as TOML.
             sequence: Where the data is, as `open_sequence` takes it; absolute, or it means another folder tomorrow.
+            request: What else was asked for, for `request.json`.
 
         Raises:
             ArchiveError: if there is something at `path` already, or the folder cannot be made.
@@ -59,6 +61,8 @@ class RunDirectory:
         except OSError as error:
             raise ArchiveError(f"cannot make the folder {path} ({error.strerror}); choose another one") from error
         atomic.write_text(path / "config.toml", config_toml)
+        if request is not None:
+            atomic.write_text(path / "request.json", request)
         about = {"kind": "run", "version": archive.VERSION, "sequence": sequence}
         atomic.write_text(path / "run.json", json.dumps(about, indent=2) + "\n")
         return RunDirectory(path)
@@ -229,7 +233,7 @@ def is_free(path: Path) -> bool:
     if not path.is_dir():
         return not path.exists()
     names = {entry.name for entry in path.iterdir() if not entry.name.startswith(".")}
-    return names <= {"submaps", "config.toml"} and not any((path / "submaps").glob("*"))
+    return names <= {"submaps", "config.toml", "request.json"} and not any((path / "submaps").glob("*"))
 
 
 def _read_json(path: Path, complaint: str) -> dict[str, object]:
