@@ -24,6 +24,7 @@ from tcgsplat.datasets.playback import Arrival, Clock, in_turn, play
 from tcgsplat.errors import ArchiveError
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.slam import Slam, StepReport
+from tcgsplat.storage import atomic
 from tcgsplat.storage.run_directory import RunDirectory, is_free
 
 logger = logging.getLogger(__name__)
@@ -85,8 +86,9 @@ def resume(path: Path, config: SlamConfig, folder: Path, part: Part) -> RunDirec
     other = [f"{name} was {then[name]} and is {now[name]}" for name in now if now[name] != then[name]]
     if other:
         raise ArchiveError(f"the run in {path} has other settings: {'; '.join(other)}; resume it with the same ones")
-    for outdated in ("summary.json", "map.npz", "report.json", "localized.txt"):
-        (path / outdated).unlink(missing_ok=True)
+    outdated = (path / name for name in ("summary.json", "map.npz", "report.json", "localized.txt"))
+    for file in (*outdated, *path.rglob(atomic.PARTIAL)):
+        file.unlink(missing_ok=True)
     return run
 
 

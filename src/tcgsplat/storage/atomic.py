@@ -10,6 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
+PARTIAL = ".*.partial"
+"""Pattern of the names of what a killed writer leaves behind."""
+
 
 @contextmanager
 def writing(path: Path) -> Iterator[BinaryIO]:
