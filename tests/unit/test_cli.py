@@ -17,9 +17,10 @@ from numba import njit
 
 from tcgsplat import __version__
 from tcgsplat.cli import doctor, kernels, logs, presets, summary
+from tcgsplat.cli.interrupt import stopping_on_interrupt
 from tcgsplat.cli.main import COMMANDS, main
 from tcgsplat.cli.progress import RunProgress, counting
-from tcgsplat.cli.recorder import Part, begin, stopping_on_interrupt
+from tcgsplat.cli.recorder import Part, begin
 from tcgsplat.cli.settings import resolved
 from tcgsplat.cli.usage import UsageError
 from tcgsplat.config import SlamConfig, from_toml

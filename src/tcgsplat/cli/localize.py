@@ -44,10 +44,10 @@ def command(args: Args) -> int:
     """One line for each picture, and the file of the poses."""
     import torch
 
+    from tcgsplat.cli.interrupt import stopping_on_interrupt
     from tcgsplat.cli.kernels import compile_kernels
     from tcgsplat.cli.pictures import frames_of, relocalizer
     from tcgsplat.cli.progress import say
-    from tcgsplat.cli.recorder import stopping_on_interrupt
     from tcgsplat.config import from_toml
     from tcgsplat.render.backends import open_rasterizer
     from tcgsplat.scene.trajectory import format_tum

@@ -4,17 +4,16 @@ import json
 import logging
 import shlex
 import shutil
-import signal
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterable
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 
+from tcgsplat.cli.interrupt import stopping_on_interrupt
 from tcgsplat.cli.kernels import compile_kernels
 from tcgsplat.cli.progress import RunProgress, say
 from tcgsplat.cli.summary import Summary, Tally
@@ -211,20 +210,3 @@ def record(
         interrupted=interrupted,
     )
     return replace(summary, depth_delay_ms=1e3 * slam.delay.seconds)
-
-
-@contextmanager
-def stopping_on_interrupt() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets, so that a frame is never left half mapped; the second one is as ever."""
-    stop = threading.Event()
-
-    def first(*_: object) -> None:
-        stop.set()
-        signal.signal(signal.SIGINT, previous)
-        sys.stderr.write("tcgsplat: stopping after this frame; Ctrl-C again to stop at once\n")
-
-    previous = signal.signal(signal.SIGINT, first)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, previous)

@@ -1,10 +1,7 @@
 """`tcgsplat refine`: all submaps of a run as one map, optimised over all keyframes."""
 
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,6 +32,7 @@ def command(args: Args) -> int:
     """Merge, refine, write, and say so."""
     import torch
 
+    from tcgsplat.cli.interrupt import stopping_on_interrupt
     from tcgsplat.cli.kernels import compile_kernels
     from tcgsplat.cli.progress import counting, say
     from tcgsplat.cli.usage import UsageError
@@ -57,7 +55,10 @@ def command(args: Args) -> int:
     sys.stdout.flush()
     keyframes = len(merged.submap.keyframes)
     done = for_seconds(args.seconds) if args.steps is None else for_steps(args.steps * keyframes)
-    with counting("refined, %:") as tell, _stopping_on_interrupt() as stop:
+    with (
+        counting("refined, %:") as tell,
+        stopping_on_interrupt("stopping; Ctrl-C again to leave the run as it was") as stop,
+    ):
         effort = _Effort(done, stop.is_set, tell)
         generator = torch.Generator().manual_seed(config.seed)
         submap = refined(merged.submap, config.mapper, config.confidence, rasterizer, generator, effort)
@@ -82,20 +83,3 @@ class _Effort:
         share = 1.0 if self._stopped() else self._done(steps)
         self._tell(min(round(100 * share), 100), 100)
         return share
-
-
-@contextmanager
-def _stopping_on_interrupt() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the second one is as ever."""
-    stop = threading.Event()
-
-    def first(*_: object) -> None:
-        stop.set()
-        signal.signal(signal.SIGINT, previous)
-        sys.stderr.write("tcgsplat: stopping; Ctrl-C again to leave the run as it was\n")
-
-    previous = signal.signal(signal.SIGINT, first)
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGINT, previous)
