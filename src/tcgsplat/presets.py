@@ -89,6 +89,7 @@ _STEPS = "for mapping updates of 100 steps: "
 _PUBLISHED: tuple[tuple[str, _Three, Origin, str], ...] = (
     ("tracker.solver", _same("descent"), "paper", "Section 3.3 moves the camera by gradients through the rasterizer"),
     ("tracker.synchronization", _same("none"), "base", "the base system takes both images for one instant"),
+    ("tracker.smoothing", _same(False), "base", "the base system takes depth as it comes"),
     ("tracker.exposure", _same(False), "ours", "the paper maps pictures as they come"),
     ("tracker.descent.iterations", (60, 200, 200), "base", "the base system doubles them for a bad start; we do not"),
     ("tracker.descent.rotation_rate", (0.0002, 0.002, 0.002), "base", "cam_rot_lr"),

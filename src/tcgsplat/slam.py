@@ -37,6 +37,7 @@ from tcgsplat.storage.store import InMemory, SubmapStore
 from tcgsplat.tensors import Pose
 from tcgsplat.tracking.delay import DepthDelay
 from tcgsplat.tracking.motion import ConstantVelocity
+from tcgsplat.tracking.smoothing import smoothed
 from tcgsplat.tracking.synchronization import synchronized
 from tcgsplat.tracking.tracker import Tracked, Tracker
 
@@ -164,6 +165,7 @@ class Slam:
     def step(self, frame: Frame) -> StepReport:
         """Track, perhaps switch submap, perhaps map; the first frame's camera is the origin of the world."""
         frame, sealed, found, clock = frame.to(self._device), None, None, _Laps()
+        frame = smoothed(frame) if self.config.tracker.smoothing else frame
         self._since_mapped += 1
 
         # The map that was optimised meanwhile comes into use, and the submaps stand where comparing the last one with

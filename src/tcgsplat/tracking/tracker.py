@@ -33,6 +33,9 @@ class TrackerConfig:
     synchronization: Literal["none", "stamps", "learnt"] = "learnt"
     """What is done about the time between colour and depth: nothing; the depth image is moved to the instant of the
     colour image by the camera's velocity; so, and what the time stamps conceal is learnt from the motion. [ours]"""
+    smoothing: bool = True
+    """Whether depth is smoothed within its surfaces before anything else is done with it: a sensor that rounds makes
+    the camera seem to move too little. [ours]"""
     exposure: bool = True
     """Whether the map keeps one brightness and every picture its exposure beside it, as `alignment` finds it; else
     pictures are mapped as they come. [ours]"""
