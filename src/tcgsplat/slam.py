@@ -206,7 +206,7 @@ class Slam:
             T_map_cam, exposure = se3.identity(), UNCHANGED
 
         # Map: grow where the view is new, and have it all optimised and judged while the next frames are tracked.
-        maps = may_map and self._schedule.maps(self._since_mapped, self.submap)
+        maps = may_map and self._schedule.maps(frame.index, self._since_mapped, self.submap)
         if maps:
             update = self._finished_update() or update
             clock.lap("wait")

@@ -34,21 +34,21 @@ def submap(*mapped: int) -> Submap:
 
 
 def test_a_submap_that_lost_all_its_gaussians_is_mapped_at_once() -> None:
-    assert not Schedule(MOTION).maps(1, submap(0))
-    assert Schedule(MOTION).maps(1, replace(submap(0), gaussians=Gaussians.empty()))
+    assert not Schedule(MOTION).maps(1, 1, submap(0))
+    assert Schedule(MOTION).maps(1, 1, replace(submap(0), gaussians=Gaussians.empty()))
 
 
 @pytest.mark.parametrize("config", [MOTION, INTERVAL])
 def test_the_first_frame_is_mapped_and_begins_no_second_submap(config: ScheduleConfig) -> None:
     schedule = Schedule(config)
-    assert schedule.maps(0, EMPTY)
-    assert schedule.maps(77, EMPTY)
+    assert schedule.maps(0, 0, EMPTY)
+    assert schedule.maps(77, 77, EMPTY)
     assert not schedule.switches_submap(77, pose(9.0), EMPTY)
 
 
 def test_mapping_comes_round_after_the_last_mapped_frame() -> None:
     schedule = Schedule(MOTION)
-    assert [i for i in range(1, 7) if schedule.maps(i, submap(3, 10))] == [4, 5, 6]
+    assert [i for i in range(1, 7) if schedule.maps(10 + i, i, submap(3, 10))] == [4, 5, 6]
 
 
 def test_an_update_is_adopted_after_its_lag() -> None:
@@ -89,3 +89,25 @@ def test_rhythm_that_cannot_be_is_refused_by_name(name: str, value: int) -> None
 def test_an_unknown_rule_is_refused_by_name() -> None:
     with pytest.raises(ConfigError, match=r"schedule\.submap_by is 'mood'; choose motion or interval"):
         ScheduleConfig(submap_by="mood")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("config", [MOTION, INTERVAL])
+def test_withheld_frames_are_neither_mapped_nor_begin_a_submap(config: ScheduleConfig) -> None:
+    schedule = Schedule(replace(config, withhold_every=8))
+    assert [i for i in range(20, 30) if schedule.maps(i, i - 16, submap(16))] == [20, 21, 22, 23, 25, 26, 27, 28, 29]
+    gone = replace(submap(16), gaussians=Gaussians.empty())
+    assert [i for i in range(22, 27) if schedule.maps(i, 1, gone)] == [22, 23, 25, 26]
+    assert [i for i in range(46, 51) if schedule.switches_submap(i, pose(9.0), submap(16))] == [46, 47, 49, 50]
+    assert not Schedule(config).config.withholds(0)
+
+
+def test_without_a_withheld_frame_there_would_be_no_map() -> None:
+    schedule = Schedule(replace(MOTION, withhold_every=8))
+    assert schedule.maps(0, 0, EMPTY)
+    assert schedule.maps(16, 1, EMPTY)
+
+
+@pytest.mark.parametrize("value", [1, -8])
+def test_not_every_frame_can_be_withheld(value: int) -> None:
+    with pytest.raises(ConfigError, match=rf"schedule\.withhold_every is {value}; it must be at least 2, or 0"):
+        replace(MOTION, withhold_every=value)
