@@ -25,6 +25,8 @@ class PairedDifference:
     low: float
     """End of the bootstrap interval; NaN if there is only one pair."""
     high: float
+    level: float
+    """Of the interval: 0.95 for 95 %."""
     by_sequence: Mapping[str, float]
     """Mean difference over the seeds of each sequence."""
     pairs: int
@@ -99,6 +101,7 @@ def _compared(
         mean=float(means.mean()),
         low=low,
         high=high,
+        level=level,
         by_sequence=dict(zip(differences, means.tolist(), strict=True)),
         pairs=len(pooled),
         left_out=len(runs) - len(pooled),

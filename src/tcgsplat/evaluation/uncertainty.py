@@ -28,6 +28,7 @@ STEPS = 100
 """Points of a sparsification curve, as FisherRF has."""
 _MOST_REMOVED = 0.999
 _BINS = 15
+_LEVELS = 1001
 _NEGLIGIBLE = 1e-9
 """Share of a variance, or of an area, that rounding may leave of nothing."""
 
@@ -335,10 +336,8 @@ class Reliability:
     """Mean over each bin."""
     found: Float[np.ndarray, " bins"]
     """Mean over each bin."""
-    histogram: Float[np.ndarray, " cells"]
-    """Share of the pixels whose expected error lies in each cell."""
-    edges: Float[np.ndarray, " cells+1"]
-    """Of the cells, equally wide, from the least expected error to the greatest."""
+    quantiles: Float[np.ndarray, " levels"]
+    """Expected error at levels from 0 to 1 at even steps: how often which error is expected."""
 
     @property
     def ece(self) -> float:
@@ -352,9 +351,7 @@ class Reliability:
         return self.ece / mean if mean > 0 else math.nan
 
 
-def reliability(
-    expected: Values | Ordered, error: Values | Ordered, *, bins: int = _BINS, cells: int = 40
-) -> Reliability:
+def reliability(expected: Values | Ordered, error: Values | Ordered, *, bins: int = _BINS) -> Reliability:
     """Compare expected with found error, on images that the expectation was not fitted to.
 
     A fitted expectation is constant over many pixels; where bins divide such pixels, each gets its share of their mean.
@@ -363,7 +360,6 @@ def reliability(
         expected: By `Calibration.expected_error`, in the error's unit.
         error: e of the same pixels.
         bins: Of equally many pixels; no more than there are pixels.
-        cells: Of the histogram.
 
     Raises:
         EvaluationError: if there is no pixel, or a value is NaN, or an error negative.
@@ -373,8 +369,8 @@ def reliability(
     expected_mean, found_mean = (
         np.diff(order.sums(values, places)) / np.diff(places) for values in (order.values, e.values)
     )
-    counts, edges = np.histogram(order.values, cells)
-    return Reliability(expected_mean, found_mean, counts / len(e), edges)
+    evenly = np.arange(_LEVELS) * (len(e) - 1) // (_LEVELS - 1)
+    return Reliability(expected_mean, found_mean, order.values[order.indices[evenly]])
 
 
 def ece(expected: Values | Ordered, error: Values | Ordered, *, bins: int = _BINS) -> float:
