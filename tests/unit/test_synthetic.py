@@ -24,7 +24,7 @@ from tcgsplat.datasets.synthetic.writer import complete_or_absent
 from tcgsplat.errors import ConfigError, DatasetError
 
 Array = np.ndarray[Any, np.dtype[Any]]
-SMALL = SynthConfig(frames=12, width=64, height=48)
+SMALL = SynthConfig(frames=12, width=64, height=48, free_views=4)
 STILL = np.eye(4)[None]
 Recorder = Callable[..., Path]
 
@@ -273,7 +273,7 @@ def test_things_stand_in_their_own_shade(studio: Studio) -> None:
 def test_the_same_configuration_gives_the_same_bytes(peopled: Studio, workers: Executor, tmp_path: Path) -> None:
     everything = replace(
         SMALL, layout="replica", depth_noise=True, exposure_jumps=True, motion_blur=True, moving_object=True,
-        dropped_frames=True,
+        dropped_frames=True, depth_noise_scale=2.0, depth_bias=0.03, still=3,
     )  # fmt: skip
     reports: list[tuple[int, int]] = []
     synthesize(tmp_path / "a", everything, lambda done, total: reports.append((done, total)))
@@ -337,6 +337,8 @@ def test_a_sequence_is_there_when_it_is_complete(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "name"),
     [({"frames": 1}, "frames"), ({"width": 8}, "width"), ({"fps": 0.0}, "fps"), ({"seed": -1}, "seed"),
+     ({"depth_bias": 3.0}, "depth_bias"), ({"still": -1}, "still"), ({"free_views": -1}, "free_views"),
+     ({"depth_noise_scale": 2.0}, "depth_noise_scale"), ({"depth_noise": True, "depth_noise_scale": -1.0}, "scale"),
      ({"layout": "kitti"}, "layout"), ({"place": "attic"}, "place"), ({"fps": float("nan")}, "fps")],
 )  # fmt: skip
 def test_settings_that_cannot_be_are_named(change: dict[str, object], name: str) -> None:
@@ -354,8 +356,9 @@ def test_recording_twice_in_other_studios_gives_the_same(base: Path, recorded: R
 def test_depth_noise_changes_depth_alone(base: Path, recorded: Recorder) -> None:
     noisy = recorded(depth_noise=True)
     a, b = files(base), files(noisy)
-    assert a.keys() == b.keys()
+    assert b.keys() - a.keys() == set(some(b, "truth/depth/"))
     assert {name for name in a if a[name] != b[name]} == set(some(a, "depth/"))
+    assert list(some(b, "truth/depth/").values()) == list(some(a, "depth/").values())
     true, measured = images(base, "depth") / 5000, images(noisy, "depth") / 5000
     valid = measured > 0
     assert 0.01 < 1 - valid.mean() < 0.3
@@ -371,7 +374,7 @@ def test_exposure_jumps_scale_colour_alone(base: Path, recorded: Recorder) -> No
     jumpy = recorded(exposure_jumps=True)
     a, b = files(base), files(jumpy)
     assert b.keys() - a.keys() == {"exposure.txt"}
-    assert {name for name in a if a[name] != b[name]} <= set(some(a, "rgb/"))
+    assert {name for name in a if a[name] != b[name]} <= set(some(a, "rgb/")) | {"truth/events.json"}
     rows = [line.split() for line in (jumpy / "exposure.txt").read_text().splitlines()[1:]]
     gains = np.array([float(gain) for _, gain in rows])
     np.testing.assert_array_equal(gains, exposure_gains(12, 0))
@@ -392,8 +395,11 @@ def test_motion_blur_smooths_colour_alone(base: Path, recorded: Recorder) -> Non
 def test_the_moving_object_is_where_its_mask_says(base: Path, recorded: Recorder) -> None:
     crowded = recorded(moving_object=True)
     a, b = files(base), files(crowded)
-    assert b.keys() - a.keys() == set(some(b, "mask/"))
+    assert b.keys() - a.keys() == set(some(b, "mask/", "truth/depth/", "truth/fault/"))
     assert len(some(b, "mask/")) == 12
+    assert list(some(b, "mask/").values()) == list(some(b, "truth/fault/").values())
+    assert list(some(b, "truth/depth/").values()) == list(some(a, "depth/").values())
+    assert some(a, "free/") == some(b, "free/")
     for name in ("mesh.ply", "groundtruth.txt", "rgb.txt", "depth.txt", "camera.toml"):
         assert a[name] == b[name]
     mask = np.stack([cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in sorted((crowded / "mask").iterdir())])

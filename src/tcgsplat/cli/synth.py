@@ -23,5 +23,5 @@ def command(args: Args) -> int:
     """Write the sequence, and say where it is."""
     with counting("frame") as progress:
         synthesize(args.out, args.config, progress)
-    sys.stdout.write(f"{args.config.frames} frames, {args.config.width}x{args.config.height}: {args.out}\n")
+    sys.stdout.write(f"{args.config.timetable.recorded} frames, {args.config.width}x{args.config.height}: {args.out}\n")
     return 0

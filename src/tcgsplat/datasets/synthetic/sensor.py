@@ -26,6 +26,7 @@ class Effect(enum.IntEnum):
     DEPTH = 10
     EXPOSURE = 11
     DROPS = 12
+    FREE = 13
 
 
 def generator(seed: int, effect: Effect, frame: int = 0) -> np.random.Generator:
@@ -41,7 +42,13 @@ def _blotches(rng: np.random.Generator, shape: tuple[int, int], cell: float) -> 
 
 
 def noisy_depth(
-    depth: Array, incidence: Array, shine: Array, color: Array, focal: float, rng: np.random.Generator
+    depth: Array,
+    incidence: Array,
+    shine: Array,
+    color: Array,
+    focal: float,
+    rng: np.random.Generator,
+    spread: float = 1.0,
 ) -> Array:
     """Depth [h, w] as a structured-light sensor reports it, metres, 0 where it gets no answer.
 
@@ -52,6 +59,7 @@ def noisy_depth(
         color: Displayed colour [h, w, 3] in [0, 1].
         focal: Pixels.
         rng: For this frame alone.
+        spread: Factor on the noise of disparity; edges, holes and rounding stay what they are.
     """
     h, w = depth.shape
     pixel = w / 640.0  # effects on the image have their size in a picture 640 wide
@@ -78,7 +86,7 @@ def noisy_depth(
     disparity = _BASELINE_FOCAL / np.maximum(z, 0.05)
     white = rng.standard_normal((h, w))
     shared = 1.5 * _blotches(rng, (h, w), 4 * pixel + 1)
-    disparity = np.round(8 * (disparity + 0.035 * white + 0.030 * shared)) / 8
+    disparity = np.round(8 * (disparity + spread * 0.035 * white + spread * 0.030 * shared)) / 8
     z = _BASELINE_FOCAL / np.maximum(disparity, 0.5)
     return np.where(_holes(depth, incidence, shine, color, focal, rng), 0.0, z)
 

@@ -1,7 +1,7 @@
 """A furnished place, lit, with a camera in it: pose in, exact picture out."""
 
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -66,6 +66,19 @@ class Studio:
                 incidence = raster.incidence(triangle[0], affine, self.view)
         film = (1 - np.exp(-_EXPOSURE / len(T_world_cam) * light)) ** np.float32(1 / GAMMA)
         return Shot(film, depth, incidence, np.where(seen, self.scene.shine[patch], 0), seen & (mesh.moves[patch] > 0))
+
+    def emptied(self) -> "Studio":
+        """The same place and light without the moving object, which throws no shadow."""
+        mesh = self.scene.mesh
+        static = mesh._replace(moves=mesh.moves[mesh.moves == 0])  # patches that stand still come first
+        return replace(self, scene=self.scene._replace(mesh=static))
+
+    def inverse_depth(self, T_world_cam: Array, view: View | None = None) -> Array:
+        """Inverse depth [h, w] in 1/m of what stands still, 0 where there is nothing, by a camera of any size."""
+        T_cam_world = np.linalg.inv(T_world_cam)
+        T_cam_mesh = np.stack((T_cam_world, T_cam_world))
+        nearest, _, _ = raster.visible(self.emptied().scene.mesh, T_cam_mesh, view or self.view, raster.OFFSETS[:1])
+        return np.asarray(nearest[0])
 
 
 def furnished_studio(

@@ -2,7 +2,7 @@
 
 import json
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import torch
 
+from tcgsplat.datasets import truth
 from tcgsplat.datasets.synthetic.raster import View
 from tcgsplat.errors import DatasetError
 from tcgsplat.scene.trajectory import format_tum
@@ -66,12 +67,34 @@ class SequenceFiles:
     def write_frame(self, index: int, color: Array, depth: Array, mask: Array | None) -> None:
         """Write one frame: colour [h, w, 3] uint8 RGB, depth [h, w] metres (0 = none), mask [h, w] bool if any."""
         color_path, depth_path, mask_path = self.paths(index)
-        units = np.round(depth * DEPTH_SCALE[self.layout])
-        raw = np.where(units <= 65535, units, 0).astype(np.uint16)
         _write_image(color_path, color[..., ::-1])
-        _write_image(depth_path, raw)
+        _write_depth(depth_path, depth, DEPTH_SCALE[self.layout])
         if mask is not None:
-            _write_image(mask_path, np.where(mask, 255, 0).astype(np.uint8))
+            _write_mask(mask_path, mask)
+
+    def write_truth(self, index: int, depth: Array | None, fault: Array | None) -> None:
+        """Write what is true of one frame: depth [h, w] metres and fault [h, w] bool, each if all frames have it."""
+        if depth is not None:
+            _write_depth(truth.depth_file(self.root, index), depth, truth.DEPTH_SCALE)
+        if fault is not None:
+            _write_mask(truth.fault_file(self.root, index), fault)
+
+    def write_events(self, events: Iterable[truth.Event]) -> None:
+        """Write what happens to runs of frames."""
+        (self.root / "truth" / "events.json").write_text(truth.events_text(events))
+
+    def write_free_view(self, number: int, color: Array, depth: Array) -> None:
+        """Write a view beside the walk: colour [h, w, 3] uint8 RGB, depth [h, w] metres."""
+        color_path, depth_path = truth.free_files(self.root, number)
+        _write_image(color_path, color[..., ::-1])
+        _write_depth(depth_path, depth, truth.DEPTH_SCALE)
+
+    def write_free_poses(self, view: View, T_world_cam: Array) -> None:
+        """Write camera and poses [n, 4, 4] of the views beside the walk."""
+        free = self.root / "free"
+        numbers: list[float] = list(range(len(T_world_cam)))
+        (free / "poses.txt").write_text(format_tum(numbers, list(torch.from_numpy(T_world_cam))))
+        (free / "camera.toml").write_text(_camera_toml(view, truth.DEPTH_SCALE))
 
     def write_index(self, view: View, seconds: Array, T_world_cam: Array, kept: Array) -> None:
         """Write intrinsics, lists and ground truth, which make the folder readable.
@@ -95,13 +118,7 @@ class SequenceFiles:
         # Motion capture goes on while a camera loses frames.
         poses = list(torch.from_numpy(T_world_cam))
         (self.root / "groundtruth.txt").write_text(format_tum(list(seconds), poses))
-        (self.root / "camera.toml").write_text(
-            "# ray-cast pictures; pixel centres at integer coordinates (OpenCV convention)\n"
-            f"width = {view.width}\nheight = {view.height}\n"
-            f"fx = {view.focal!r}\nfy = {view.focal!r}\ncx = {view.cx!r}\ncy = {view.cy!r}\n"
-            "distortion = [0.0, 0.0, 0.0, 0.0, 0.0]  # k1 k2 p1 p2 k3\n"
-            f"depth_scale = {DEPTH_SCALE['tum']}  # units per metre; 0 = no reading\n"
-        )
+        (self.root / "camera.toml").write_text(_camera_toml(view, DEPTH_SCALE["tum"]))
 
     def write_gains(self, gains: Array) -> None:
         """Write `exposure.txt`: each frame's name and the factor on its displayed colour."""
@@ -109,13 +126,32 @@ class SequenceFiles:
         (self.root / "exposure.txt").write_text("\n".join(["# frame gain", *lines]) + "\n")
 
 
-def sequence_files(root: Path, layout: Layout, seconds: Array, *, masks: bool) -> SequenceFiles:
-    """Make the folders of a sequence whose recorded frames have these times [n], seconds."""
+def sequence_files(root: Path, layout: Layout, seconds: Array, extras: Iterable[str]) -> SequenceFiles:
+    """Make the folders of a sequence whose recorded frames have these times [n], seconds, and those it has besides."""
     folders = ["rgb", "depth"] if layout == "tum" else ["results"]
-    for folder in [*folders, "mask"] if masks else folders:
-        (root / folder).mkdir()
+    for folder in [*folders, "truth", *extras]:
+        (root / folder).mkdir(parents=True)
     names = [f"{t:.6f}" if layout == "tum" else f"{index:06d}" for index, t in enumerate(seconds)]
     return SequenceFiles(root, layout, tuple(names))
+
+
+def _camera_toml(view: View, depth_scale: float) -> str:
+    return (
+        "# ray-cast pictures; pixel centres at integer coordinates (OpenCV convention)\n"
+        f"width = {view.width}\nheight = {view.height}\n"
+        f"fx = {view.focal!r}\nfy = {view.focal!r}\ncx = {view.cx!r}\ncy = {view.cy!r}\n"
+        "distortion = [0.0, 0.0, 0.0, 0.0, 0.0]  # k1 k2 p1 p2 k3\n"
+        f"depth_scale = {depth_scale}  # units per metre; 0 = no reading\n"
+    )
+
+
+def _write_depth(path: Path, depth: Array, scale: float) -> None:
+    units = np.round(depth * scale)
+    _write_image(path, np.where(units <= 65535, units, 0).astype(np.uint16))
+
+
+def _write_mask(path: Path, mask: Array) -> None:
+    _write_image(path, np.where(mask, 255, 0).astype(np.uint8))
 
 
 def _write_image(path: Path, image: Array) -> None:
