@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 from tcgsplat.evaluation import images
 
@@ -79,3 +80,58 @@ def test_ssim_does_not_see_invalid_pixels(generator: torch.Generator) -> None:
     spoiled = b.clone()
     spoiled[:, :3] = 0.0
     assert images.ssim(a, spoiled, valid) == pytest.approx(images.ssim(a, b, valid), abs=1e-6)
+
+
+def ms_ssim_by_definition(a: np.ndarray, b: np.ndarray, valid: np.ndarray) -> float:
+    """Wang et al. 2003 with pytorch_msssim's halving, by scipy and slices."""
+    product = np.ones(3)
+    for scale, exponent in enumerate((0.0448, 0.2856, 0.3001, 0.2363, 0.1333)):
+        if scale:
+            a, b, valid = (halved(x, x.shape[0] % 2, x.shape[1] % 2) for x in (a, b, valid))
+        whole = ndimage.binary_erosion(valid == 1, np.ones((11, 11)))  # beyond the border nothing is valid
+
+        def mean(x: np.ndarray) -> np.ndarray:
+            return np.stack([ndimage.gaussian_filter(x[..., c], 1.5, radius=5) for c in range(3)])[:, whole]  # noqa: B023
+
+        ma, mb = mean(a), mean(b)
+        va, vb, cov = mean(a * a) - ma**2, mean(b * b) - mb**2, mean(a * b) - ma * mb
+        similar = (2 * cov + 9e-4) / (va + vb + 9e-4)
+        if scale == 4:
+            similar = similar * (2 * ma * mb + 1e-4) / (ma**2 + mb**2 + 1e-4)
+        product *= similar.mean(axis=1).clip(0) ** exponent
+    return float(product.mean())
+
+
+def halved(x: np.ndarray, odd_rows: int, odd_columns: int) -> np.ndarray:
+    """Means of 2 x 2; of a mask 1 where all that are real are valid."""
+    fill = 1.0 if x.ndim == 2 else 0.0
+    x = np.pad(x, [(odd_rows, 0), (odd_columns, 0), (0, 0)][: x.ndim], constant_values=fill)
+    x = (x[::2] + x[1::2]) / 2
+    x = (x[:, ::2] + x[:, 1::2]) / 2
+    return (x == 1).astype(float) if x.ndim == 2 else x
+
+
+@pytest.mark.parametrize("size", [(161, 203), (192, 256)])
+def test_ms_ssim_is_its_definition(generator: torch.Generator, size: tuple[int, int]) -> None:
+    a, b = noisy_pair(generator, *size)
+    valid = torch.ones(*size, dtype=torch.bool)
+    whole = ms_ssim_by_definition(a.double().numpy(), b.double().numpy(), valid.double().numpy())
+    assert images.ms_ssim(a, b, valid) == pytest.approx(whole, abs=1e-9)
+    valid[:, 190:] = False
+    b[:, 190:] = 0.0
+    masked = ms_ssim_by_definition(a.double().numpy(), b.double().numpy(), valid.double().numpy())
+    assert images.ms_ssim(a, b, valid) == pytest.approx(masked, abs=1e-9)
+    assert abs(masked - whole) > 1e-6
+    spoiled = b.clone()
+    spoiled[:, 190:] = 1.0
+    assert images.ms_ssim(a, spoiled, valid) == pytest.approx(masked, abs=1e-9)
+
+
+def test_ms_ssim_ends() -> None:
+    a = torch.rand(161, 161, 3, generator=torch.Generator().manual_seed(1))
+    valid = torch.ones(161, 161, dtype=torch.bool)
+    assert images.ms_ssim(a, a, valid) == pytest.approx(1.0)
+    assert images.ms_ssim(a, 1 - a, valid) == 0.0
+    assert math.isnan(images.ms_ssim(a[:160], a[:160], valid[:160]))
+    valid[:, 80] = False  # at the coarsest scale there is no window left beside it
+    assert math.isnan(images.ms_ssim(a, a, valid))

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from tcgsplat.confidence.state import ConfidenceState
+from tcgsplat.confidence.state import ConfidenceConfig, ConfidenceState
 from tcgsplat.errors import EvaluationError
 from tcgsplat.evaluation import figures
-from tcgsplat.evaluation.report import Metric, Report, associate, evaluate, score_trajectory
+from tcgsplat.evaluation.accuracy import associate
+from tcgsplat.evaluation.lpips import Lpips
+from tcgsplat.evaluation.report import Metric, Report, evaluate, score_trajectory
 from tcgsplat.evaluation.views import spread
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
@@ -91,10 +93,9 @@ def wall(index: int, T_world_map: Pose) -> Submap:
             logit_opacities=torch.full((n,), 3.0),
             sh=torch.randn(n, 1, 3, generator=generator),
         ),
-        confidence=ConfidenceState(
+        confidence=replace(
+            ConfidenceState.born_at(0, n, ConfidenceConfig()),
             value=torch.rand(n, generator=generator),
-            baseline=torch.zeros(n),
-            born=torch.zeros(n, dtype=torch.int64),
             updates=torch.ones(n, dtype=torch.int64),
         ),
         clock=1,
@@ -191,18 +192,32 @@ def test_figures_of_a_run(run: RunDirectory, sequence: Recorded, rasterizer: Ras
     assert value["loops"] == 3
     assert value["gaussians"] == 2 * len(wall(0, at(0.0)))
     assert (value["ms_per_frame"], value["peak_rss_mb"]) == (250.0, 512.5)
-    assert report.missing == {}
-    assert unit == {
-        "ate_rmse": "cm", "psnr_withheld": "dB", "ssim_withheld": "", "depth_l1_withheld": "cm",
-        "psnr_withheld_unexposed": "dB", "psnr_withheld_mapped": "dB", "coverage_withheld": "%",
-        "psnr_map_withheld": "dB", "ssim_map_withheld": "", "depth_l1_map_withheld": "cm", "coverage_map_withheld": "%",
-        "psnr": "dB", "ssim": "", "depth_l1": "cm", "depth_coverage": "%", "frames": "",
-        "frames_lost": "", "seconds_lost": "s", "loops": "", "submaps": "", "gaussians": "", "gaussians_map": "",
-        "ms_per_frame": "ms", "peak_rss_mb": "MB",
+    assert value["frames_tracked"] == 87.5
+    assert value["psnr_map"] > 10.0 and value["psnr_map"] != value["psnr"]
+    assert value["coverage"] == value["coverage_map"] == 100.0
+    assert value["rpe_translation"] > 1.0 and value["ate_rmse_sim3"] < value["ate_rmse"]
+    assert value["rpe_rotation"] == pytest.approx(0.0, abs=1e-5)
+    kinds, figures_of_views = ("", "_withheld", "_map", "_map_withheld"), ("psnr", "ssim", "depth_l1", "coverage")
+    assert {f"{figure}{kind}" for figure in figures_of_views for kind in kinds} <= value.keys()
+    too_small = "views are too small for its five scales: 161 valid pixels across and down"
+    assert report.missing == {
+        **{f"ms_ssim{kind}": too_small for kind in kinds},
+        **{f"lpips{kind}": "not available: give the weights by --lpips" for kind in kinds},
+        "rpe_translation_1s": "no two poses are a second apart",
+        "rpe_rotation_1s": "no two poses are a second apart",
+    }
+    assert {name: unit[name] for name in ("ate_rmse", "rpe_rotation", "frames_tracked", "seconds_lost")} == {
+        "ate_rmse": "cm", "rpe_rotation": "deg", "frames_tracked": "%", "seconds_lost": "s",
     }  # fmt: skip
-    assert list(unit)[:12] == ["ate_rmse", *(name for name in unit if "withheld" in name), "psnr"]
-    assert report.evaluated["poses"] == "estimated, and so are exposures (psnr_withheld_unexposed: one for a submap)"
-    assert "training views" in report.evaluated["views"]
+    assert {name: unit[name] for name in unit if "withheld" in name} == {
+        "psnr_withheld": "dB", "ssim_withheld": "", "depth_l1_withheld": "cm",
+        "psnr_withheld_unexposed": "dB", "psnr_withheld_mapped": "dB", "coverage_withheld": "%",
+        "depth_coverage_withheld": "%",
+        "psnr_map_withheld": "dB", "ssim_map_withheld": "", "depth_l1_map_withheld": "cm", "coverage_map_withheld": "%",
+        "psnr_map_withheld_unexposed": "dB", "psnr_map_withheld_mapped": "dB", "depth_coverage_map_withheld": "%",
+    }  # fmt: skip
+    assert report.evaluated["poses"].startswith("estimated, and so are exposures")
+    assert report.evaluated["training"] == "all keyframes of the saved submaps"
     assert report.evaluated["withheld"].startswith("3 of 3 frames")
     assert report.evaluated["withheld"].endswith("spread evenly")
     assert report.evaluated["trajectory"].startswith("7 of 8 frames")
@@ -418,13 +433,16 @@ def test_killed_run_without_data_is_still_scored(run: RunDirectory, rasterizer: 
     assert report.metrics["submaps"].value == 1
     assert report.metrics["psnr"].value > 50.0
     withheld = {name for name in report.missing if "withheld" in name}
-    assert report.missing.keys() == {"ate_rmse", "loops", "ms_per_frame", "peak_rss_mb"} | withheld
-    assert len(withheld) == 10
+    of_path = {name for name in report.missing if name.startswith(("ate_", "rpe_"))}
+    never = {"lpips", "lpips_map", "ms_ssim", "ms_ssim_map"}
+    assert report.missing.keys() == {"loops", "ms_per_frame", "peak_rss_mb"} | of_path | withheld | never
+    assert (len(withheld), len(of_path)) == (18, 6)
     assert report.missing["psnr_withheld"] == "the sequence is not at hand"
     assert report.evaluated["withheld"].startswith("0 of 2 frames")
     assert report.missing["ate_rmse"] == "no ground truth"
     assert "was killed" in report.missing["ms_per_frame"]
-    assert "one keyframe in 2" in report.evaluated["views"]
+    assert "one keyframe in 2" in report.evaluated["training"]
+    assert report.metrics["psnr_map"].value > 10.0
     assert "/data/wall" in report.evaluated["sequence"]
 
 
@@ -452,13 +470,85 @@ def test_report_on_disk_and_on_a_terminal(tmp_path: Path) -> None:
         "evaluated": {"poses": "estimated", "missing": {"psnr": "no view has a pixel that counts"}},
     }
     assert report.table().splitlines() == [
-        "ate_rmse      1.235 cm",
-        "frames        12345",
-        "ms_per_frame  1235 ms",
-        "psnr          - (no view has a pixel that counts)",
+        "ate_rmse        1.235 cm",
+        "frames          12345",
+        "ms_per_frame    1235 ms",
         "",
-        "poses         estimated",
+        "                submaps, as mapped online   all in one map",
+        "                training      withheld      training      withheld",
+        "psnr            - (1)",
+        "(1)  no view has a pixel that counts",
+        "",
+        "poses  estimated",
     ]
+
+
+def test_views_stand_side_by_side_on_a_terminal() -> None:
+    metrics = {
+        "ate_rmse": Metric(1.23456, "cm"),
+        "psnr": Metric(26.2, "dB"), "psnr_withheld": Metric(25.02, "dB"), "psnr_map": Metric(27.5, "dB"),
+        "psnr_map_withheld": Metric(26.111, "dB"), "psnr_withheld_unexposed": Metric(24.68, "dB"),
+        "ssim": Metric(0.8745), "ssim_map": Metric(0.9), "frames": Metric(193),
+    }  # fmt: skip
+    away, no_weights = "the sequence is not at hand", "not available: give the weights by --lpips"
+    missing = {"ssim_withheld": away, "lpips": no_weights, "lpips_withheld": no_weights, "ssim_map_withheld": away}
+    assert Report(metrics, {}, missing | {"rpe_rotation": "no ground truth"}).figures().splitlines() == [
+        "ate_rmse        1.235 cm",
+        "",
+        "                submaps, as mapped online   all in one map",
+        "                training      withheld      training      withheld",
+        "psnr            26.20 dB      25.02 dB      27.50 dB      26.11 dB",
+        "psnr_unexposed                24.68 dB",
+        "ssim            0.8745        - (1)         0.9000        - (1)",
+        "lpips           - (2)         - (2)",
+        "(1)  the sequence is not at hand",
+        "(2)  not available: give the weights by --lpips",
+        "",
+        "frames          193",
+        "rpe_rotation    - (no ground truth)",
+    ]
+    long = Report({"frames": Metric(3)}, {"poses": "estimated " * 30, "run": "r"}).table().splitlines()
+    assert max(map(len, long)) <= 120 and long[3].startswith("       estimated") and long[-1] == "run    r"
+
+
+def test_frames_kept_back_on_purpose_are_the_withheld_ones(
+    run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer
+) -> None:
+    """All of them, and no others, though more were never mapped; the first is mapped, and one is lost."""
+    (run.path / "config.toml").write_text("[schedule]\nwithhold_every = 3\n")
+    report = evaluate(run, sequence, rasterizer)
+    assert sequence.asked == [3]
+    assert report.evaluated["withheld"].startswith("1 of 1 frames that schedule.withhold_every kept back")
+    assert "a multiple of 3" in report.evaluated["withheld"]
+    (run.path / "config.toml").write_text("[schedule]\nwithhold_every = 7\n")
+    assert "was mapped or lost" in evaluate(run, sequence, rasterizer).missing["psnr_withheld"]
+
+
+def test_all_frames_kept_back_are_drawn_unless_told_otherwise(
+    run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer
+) -> None:
+    (run.path / "config.toml").write_text("[schedule]\nwithhold_every = 2\n")
+    trajectory, atlas = run.trajectory()
+    rows = tuple(replace(row, mapped=row.frame_index % 2 == 1, lost=False) for row in trajectory.rows)
+    run.write_trajectory(Trajectory(rows), atlas)
+    evaluate(run, sequence, rasterizer)
+    assert sequence.asked == [0, 2, 4, 6]
+    sequence.asked.clear()
+    evaluate(run, sequence, rasterizer, withheld_every=2)
+    assert len(sequence.asked) == 2
+
+
+def test_perceptual_distance_with_weights(run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer) -> None:
+    """Random ones: that of the keyframes, which the map shows as they are, is near 0."""
+    generator = torch.Generator().manual_seed(0)
+    shapes = {0: (64, 3, 11, 11), 3: (192, 64, 5, 5), 6: (384, 192, 3, 3), 8: (256, 384, 3, 3), 10: (256, 256, 3, 3)}
+    weights = {f"lin{i}.model.1.weight": torch.ones(1, n[0], 1, 1) for i, n in enumerate(shapes.values())}
+    for number, shape in shapes.items():
+        weights[f"features.{number}.weight"] = 0.1 * (torch.rand(shape, generator=generator) - 0.5)
+        weights[f"features.{number}.bias"] = torch.zeros(shape[0])
+    value = {name: m.value for name, m in evaluate(run, sequence, rasterizer, lpips=Lpips(weights)).metrics.items()}
+    assert 0.0 < value["lpips"] < 1e-3 and value["lpips_withheld"] > 10 * value["lpips"]
+    assert value["lpips_map"] > 10 * value["lpips"] and value["lpips_map_withheld"] > 0.0
 
 
 def test_pictures_of_a_run(run: RunDirectory, sequence: Recorded, rasterizer: Rasterizer) -> None:
@@ -488,7 +578,17 @@ def test_trajectory_of_another_system(tmp_path: Path, sequence: Recorded) -> Non
     report = score_trajectory(tmp_path / "other.txt", sequence)
     assert report.metrics["ate_rmse"].value == pytest.approx(expected_ate_cm(), abs=1e-6)
     assert report.metrics["frames"].value == 7
+    assert report.metrics["frames_tracked"].value == 100.0
+    assert {"ate_rmse_sim3", "rpe_translation", "rpe_rotation"} <= report.metrics.keys()
     assert "7 of its 8 poses, against 7 frames" in report.evaluated["trajectory"]
+
+
+def test_frames_without_a_pose_are_not_tracked(tmp_path: Path, sequence: Recorded) -> None:
+    (tmp_path / "other.txt").write_text(
+        format_tum([100.0 + i / 30 for i in range(3, 8)], [at(0.1 * i) for i in range(5)])
+    )
+    metrics = score_trajectory(tmp_path / "other.txt", sequence).metrics
+    assert (metrics["frames_tracked"], metrics["frames"]) == (Metric(62.5, "%"), Metric(4))  # frame 3 has no truth
 
 
 def test_trajectory_that_cannot_be_scored(tmp_path: Path, sequence: Recorded) -> None:

@@ -25,7 +25,11 @@ class Args:
     stride: int = 1
     """Draw every so many-th keyframe."""
     withheld_every: int | None = None
-    """Draw one in so many of the frames that were never mapped; if not given, 120 of them at most."""
+    """Draw one in so many of the frames that were never mapped. If not given: all that --schedule.withhold-every kept
+    back from the run's map, or 120 at most of those that only happened not to be mapped."""
+    lpips: Path | None = None
+    """Weights for LPIPS: a state dict with AlexNet's `features.N.weight` and `.bias` (torchvision's names) and the
+    linear heads `lin0.model.1.weight` to `lin4.model.1.weight`. Without them LPIPS is reported as not available."""
     backend: str = "auto"
     """Rasterizer: auto, numba or reference."""
 
@@ -52,6 +56,6 @@ def command(args: Args) -> int:
     if run is None:
         raise UsageError("give a run directory, or --trajectory and --sequence")
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
-    report = scored(run, sequence, rasterizer, args.stride, args.withheld_every)
+    report = scored(run, sequence, rasterizer, args.stride, args.withheld_every, args.lpips)
     sys.stdout.write(f"{report.table()}\n\nreport.json, contact_sheet.png and trajectory.png are in {run.path}\n")
     return 0

@@ -8,6 +8,7 @@ from tcgsplat.cli.recorder import Part
 from tcgsplat.datasets import Sequence
 from tcgsplat.evaluation import canvas
 from tcgsplat.evaluation.figures import contact_sheet_of, trajectory_plot_of
+from tcgsplat.evaluation.lpips import Lpips
 from tcgsplat.evaluation.report import Report, evaluate
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.storage.run_directory import RunDirectory
@@ -21,10 +22,20 @@ def scored(
     rasterizer: Rasterizer,
     stride: int = 1,
     withheld_every: int | None = None,
+    lpips: Path | None = None,
 ) -> Report:
     """The report of a run; it and the pictures are in the run directory."""
+    distance = None if lpips is None else Lpips.read(lpips, rasterizer.device)
     with counting("frame") as progress:
-        report = evaluate(run, sequence, rasterizer, stride=stride, withheld_every=withheld_every, progress=progress)
+        report = evaluate(
+            run,
+            sequence,
+            rasterizer,
+            stride=stride,
+            withheld_every=withheld_every,
+            lpips=distance,
+            progress=progress,
+        )
     report.write(run.path / "report.json")
     canvas.write_png(run.path / "contact_sheet.png", contact_sheet_of(run, sequence, rasterizer))
     canvas.write_png(run.path / "trajectory.png", trajectory_plot_of(run, sequence))

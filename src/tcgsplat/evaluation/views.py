@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from tcgsplat.config import from_toml
 from tcgsplat.datasets.sequence import Sequence
 from tcgsplat.evaluation import images
+from tcgsplat.evaluation.lpips import Lpips
 from tcgsplat.mapping.merging import Merged
 from tcgsplat.render.view import MIN_COVERAGE, Rendering
 from tcgsplat.scene.atlas import Atlas
@@ -45,9 +47,13 @@ class ViewScore:
     psnr: float
     """dB, over the valid pixels."""
     psnr_unexposed: float
-    """dB, as if no picture's exposure were known: with the one in the middle of the submap's keyframes for all."""
+    """dB, as if no picture's exposure were known: with the one in the middle of the map's keyframes for all."""
     ssim: float
     """Over the windows of valid pixels."""
+    ms_ssim: float
+    """The same at five scales; NaN too where the image is too small for them."""
+    lpips: float
+    """Over the valid pixels; NaN too where nobody has given its weights."""
     depth_l1: float
     """Centimetres, over the valid pixels with a sensor reading; where nothing is mapped, the reading in full."""
     depth_coverage: float
@@ -58,8 +64,8 @@ class ViewScore:
     """Percent of the valid pixels that are covered so."""
 
     @staticmethod
-    def of(rendering: Rendering, view: PosedFrame, middle: Exposure) -> "ViewScore":
-        """The score of a rendering from where the view's frame was taken; `middle` is the submap's mean exposure."""
+    def of(rendering: Rendering, view: PosedFrame, middle: Exposure, lpips: Lpips | None = None) -> "ViewScore":
+        """The score of a rendering from where the view's frame was taken; `middle` is the map's mean exposure."""
         frame, depth = view.frame, rendering.depth
         color = view.exposure.applied(rendering.color).clamp(0.0, 1.0)
         mapped, read = rendering.alpha > MIN_COVERAGE, frame.valid & (frame.depth > 0)
@@ -67,6 +73,8 @@ class ViewScore:
             psnr=images.psnr(color, frame.color, frame.valid),
             psnr_unexposed=images.psnr(middle.applied(rendering.color).clamp(0.0, 1.0), frame.color, frame.valid),
             ssim=images.ssim(color, frame.color, frame.valid),
+            ms_ssim=images.ms_ssim(color, frame.color, frame.valid),
+            lpips=lpips(color, frame.color, frame.valid) if lpips is not None else math.nan,
             depth_l1=100.0 * images.depth_l1(depth, frame.depth, read),
             depth_coverage=100.0 * float((depth[read] > 0).to(depth.dtype).mean()),
             psnr_mapped=images.psnr(color, frame.color, frame.valid & mapped),
@@ -74,11 +82,16 @@ class ViewScore:
         )
 
 
+def withholding(run: RunDirectory) -> int:
+    """Every so many-th frame the run has kept back from mapping, so that its map can be judged; 0: none on purpose."""
+    return from_toml(run.config_toml).schedule.withhold_every
+
+
 def withheld_rows(run: RunDirectory, trajectory: Trajectory) -> tuple[TrackedPose, ...]:
     """Frames that were tracked but never mapped, in submaps that are saved; lost ones do not count.
 
-    A run of an older tcgsplat does not tell which frames it mapped. There all frames count that are not keyframes of a
-    saved submap, those among them that were keyframes once.
+    Where the run has kept frames back on purpose, these alone. A run of an older tcgsplat does not tell which frames it
+    mapped. There all frames count that are not keyframes of a saved submap, those among them that were keyframes once.
 
     Raises:
         ArchiveError: if a file of the run is damaged.
@@ -87,7 +100,8 @@ def withheld_rows(run: RunDirectory, trajectory: Trajectory) -> tuple[TrackedPos
     if not mapped:
         for index in range(run.submap_count):
             mapped |= {keyframe.frame.index for keyframe in run.load_submap(index).keyframes}
-    saved = [row for row in trajectory.rows if row.submap_index < run.submap_count]
+    every = withholding(run) or 1
+    saved = [row for row in trajectory.rows if row.submap_index < run.submap_count and row.frame_index % every == 0]
     return tuple(row for row in saved if not row.lost and row.frame_index not in mapped)
 
 
