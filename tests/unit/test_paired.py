@@ -50,6 +50,7 @@ def test_sequences_count_the_same_whatever_their_number_of_seeds() -> None:
 def test_intervals_hang_on_the_seed_and_not_on_order_or_other_arms() -> None:
     values = results(-0.3)
     (found,) = paired_differences(values, "off", seed=1)
+    assert list(found.by_sequence) == [f"room{i}" for i in range(6)]
     other = {("other", sequence, seed): 0.0 for _, sequence, seed in values}
     assert paired_differences(other | dict(reversed(values.items())), "off", seed=1)[1] == found
     (again,) = paired_differences(values, "off", seed=2)

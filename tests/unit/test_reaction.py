@@ -21,6 +21,12 @@ def test_a_step_down_and_up_again() -> None:
     assert (time_to_drop(values, 20, 40), time_to_recover(values, 20, 40)) == (4, 7)
 
 
+def test_a_spike_before_the_fault_does_not_raise_the_level() -> None:
+    values = series((10, 0.75), (1, 1.0), (9, 0.75), (5, 0.6), (15, 0.25))
+    assert reaction(values, 20).before == 0.75
+    assert time_to_drop(values, 20) == 5
+
+
 def test_at_once() -> None:
     values = series((20, 0.8), (10, 0.4), (10, 0.8))
     assert (time_to_drop(values, 20, 30), time_to_recover(values, 20, 30)) == (0, 0)
