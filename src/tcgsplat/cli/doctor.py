@@ -16,7 +16,7 @@ class Args:
 
 @dataclass(frozen=True)
 class Finding:
-    """What is known of one backend."""
+    """What is known of one backend, or of what is not always installed."""
 
     backend: str
     usable: bool
@@ -33,7 +33,8 @@ def command(args: Args) -> int:  # noqa: ARG001
     from tcgsplat.cli.summary import machine, versions
 
     packages = ", ".join(f"{name} {number}" for name, number in versions().items())
-    findings = (numba_finding(), cuda_finding(), Finding("reference", True, ("plain torch, slow: for checking",)))
+    reference = Finding("reference", True, ("plain torch, slow: for checking",))
+    findings = (numba_finding(), cuda_finding(), reference, mesh_finding())
     sys.stdout.write(f"{packages}\n{platform.platform()}; {machine()}\n")
     sys.stdout.writelines(f"{finding}\n" for finding in findings)
     return 0 if findings[0].usable else 1
@@ -78,3 +79,15 @@ def cuda_finding() -> Finding:
     return Finding(
         "cuda", False, ("not built yet in this version: nothing to do but use the CPU", device, f"gsplat {gsplat}")
     )
+
+
+def mesh_finding() -> Finding:
+    """Open3D, for `export --mesh` and the scores of a surface."""
+    from tcgsplat.errors import BackendUnavailableError
+    from tcgsplat.mapping.fusion import open3d
+
+    try:
+        number = open3d().__version__
+    except BackendUnavailableError as error:
+        return Finding("mesh", False, (str(error),))
+    return Finding("mesh", True, (f"Open3D {number}: `export --mesh`, and scores of the surface",))

@@ -19,11 +19,12 @@ from tcgsplat.scene.gaussians import MAX_SH_DEGREE, Gaussians
 from tcgsplat.storage import atomic
 from tcgsplat.tensors import PerGaussian
 
-_TYPES: Final = {
+TYPES: Final = {
     "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4", "float": "<f4",
     "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4",
     "float32": "<f4", "float64": "<f8",
 }  # fmt: skip
+"""PLY's names of the types of properties, and numpy's."""
 _REST_COUNTS = tuple(3 * ((degree + 1) ** 2 - 1) for degree in range(MAX_SH_DEGREE + 1))
 
 
@@ -111,9 +112,9 @@ def _parse_header(path: Path, head: str) -> tuple[int, np.dtype[np.void]]:
         raise ArchiveError(f"{path} does not begin with vertices; give a PLY of Gaussians")
     end = elements[1] if len(elements) > 1 else len(lines)
     properties = [words for words in lines[elements[0] + 1 : end] if words[:1] == ["property"]]
-    unknown = [" ".join(words) for words in properties if len(words) != 3 or words[1] not in _TYPES]
+    unknown = [" ".join(words) for words in properties if len(words) != 3 or words[1] not in TYPES]
     if unknown:
         raise ArchiveError(
             f"{path} has vertices with '{unknown[0]}', which Gaussians have not; give a PLY of Gaussians"
         )
-    return int(lines[elements[0]][2]), np.dtype([(name, _TYPES[kind]) for _, kind, name in properties])
+    return int(lines[elements[0]][2]), np.dtype([(name, TYPES[kind]) for _, kind, name in properties])
