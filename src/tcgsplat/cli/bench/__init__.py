@@ -1,4 +1,4 @@
-"""`tcgsplat bench`: how long the stages take on this machine, and what confidence is worth."""
+"""`tcgsplat bench`: how long the stages take on this machine, what confidence is worth, and the paper's tables."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -103,9 +103,106 @@ class Loops:
 
 
 @dataclass(frozen=True)
+class Confidence:
+    """See whether confidence is true: what the map claims of a frame before it has seen it, against the true depth.
+
+    Every sequence is gone through twice, with our model of confidence and with the paper's. Sequences need a folder
+    `truth`, as `tcgsplat synth` makes it. A page with tables and plots, and all figures, go to OUT. Every setting is a
+    flag, as for `tcgsplat run`.
+    """
+
+    folders: tyro.conf.Positional[tuple[Path, ...]]
+    """The sequences; calibration is judged between them, so two or more tell more."""
+    out: Path | None = None
+    """Folder for README.md, confidence.json and the plots; runs/confidence if left out."""
+    every: int = 5
+    """Predict every so many-th frame."""
+    seed: int | None = None
+    """Of all randomness; that of the preset if left out."""
+    preset: str = "default"
+    """Where the settings start from: see `tcgsplat presets`."""
+    config: Path | None = None
+    """A TOML file of settings, such as the config.toml of a run."""
+    backend: str = "auto"
+    """Rasterizer: auto, numba or reference."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteArgs:
+    """What all suites take."""
+
+    out: Path | None = None
+    """Folder for README.md, results.json, the figures and runs/; runs/bench-SUITE if left out."""
+    sequences: tuple[str, ...] = ()
+    """Only these of the suite."""
+    presets: tuple[str, ...] = ("default", "base")
+    """To compare: see `tcgsplat presets`; all others are compared with the last."""
+    seeds: int = 2
+    """Runs of each preset on each sequence."""
+    seed: int | None = None
+    """The first seed, the others follow it; that of the preset if left out."""
+    config: Path | None = None
+    """A TOML file of settings over all presets."""
+    limit: int | None = None
+    """Use no more than so many frames of each sequence."""
+    backend: str = "auto"
+    """Rasterizer: auto, numba or reference."""
+    lpips: Path | None = None
+    """Weights for LPIPS, as for `tcgsplat eval`."""
+    cluster: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="[ADDRESS]")] = None
+    """Spread the runs over a Ray cluster: that at ADDRESS, or one started on this machine if it is left out or
+    `local`. A worker that dies costs one run, which is tried again. Times are then those of whatever machine it was."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synthetic(SuiteArgs):
+    """Make four recordings of the synthetic apartment (exact; depth as from a Kinect; with somebody walking about;
+    with jumps of brightness), run each preset on each with each seed, and write a page of tables and figures.
+
+    The data is made in OUT/data. What is finished is kept: the same command, or one with more seeds, goes on from
+    there. Ctrl-C keeps what is finished. Every setting is a flag, as for `tcgsplat run`.
+    """
+
+    frames: int = 300
+    """Of each sequence."""
+    width: int = 320
+    """Pixels across; the height is three quarters of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded(SuiteArgs):
+    """What suites of recorded sequences take."""
+
+    data: Path
+    """Folder that holds the folders of the sequences."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tum(Recorded):
+    """Run the five sequences of the paper's Table 3: DATA/rgbd_dataset_freiburg1_desk, ...1_desk2, ...1_room,
+    ...2_xyz and ...3_long_office_household. Those that are not there are named and left out. As `bench synthetic`.
+    """
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replica(Recorded):
+    """Run the eight sequences of the paper's Tables 1 and 4: DATA/room0 to room2 and office0 to office4, as NICE-SLAM
+    distributes them. Those that are not there are named and left out. As `bench synthetic`.
+    """
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scannet(Recorded):
+    """Run the six scenes of the paper's Table 2: DATA/scene0000_00, 0059, 0106, 0169, 0181 and 0207, as ScanNet's own
+    tool extracts them. Those that are not there are named and left out. As `bench synthetic`.
+    """
+
+
+@dataclass(frozen=True)
 class Args:
-    """Time the mapping's kernels on random scenes, the whole system on a recorded sequence, or loop closure; or see
-    what it is worth on a sequence that confidence guides the system.
+    """Time the mapping's kernels on random scenes, the whole system on a recorded sequence, or loop closure; see what
+    it is worth on a sequence that confidence guides the system; or run a suite of sequences, and write the paper's
+    tables of it: synthetic, tum, replica or scannet.
     """
 
     what: tyro.conf.OmitSubcommandPrefixes[
@@ -114,6 +211,11 @@ class Args:
             | Annotated[Track, tyro.conf.subcommand("track")]
             | Annotated[Loops, tyro.conf.subcommand("loops")]
             | Annotated[Ablation, tyro.conf.subcommand("ablation")]
+            | Annotated[Synthetic, tyro.conf.subcommand("synthetic")]
+            | Annotated[Tum, tyro.conf.subcommand("tum")]
+            | Annotated[Replica, tyro.conf.subcommand("replica")]
+            | Annotated[Scannet, tyro.conf.subcommand("scannet")]
+            | Annotated[Confidence, tyro.conf.subcommand("confidence")]
         ]
     ]
     settings: Flags = field(default_factory=dict)
@@ -130,6 +232,14 @@ def command(args: Args) -> int:
         from tcgsplat.cli.bench import ablation
 
         return ablation.command(args.what, args.settings)
+    if isinstance(args.what, Confidence):
+        from tcgsplat.cli.bench import confidence
+
+        return confidence.command(args.what, args.settings)
+    if isinstance(args.what, SuiteArgs):
+        from tcgsplat.cli.bench import suite
+
+        return suite.command(args.what, args.settings)
     if args.settings:
         raise UsageError(f"this bench has no settings, but --{next(iter(args.settings))} was given; leave it out")
     if isinstance(args.what, Loops):

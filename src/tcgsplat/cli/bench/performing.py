@@ -1,0 +1,226 @@
+"""One run of a suite, from its data to its report, and what is kept of it."""
+
+import json
+import logging
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from tcgsplat.cli.bench.suites import Source
+from tcgsplat.cli.progress import counting
+from tcgsplat.cli.recorder import Part, begin, recorded, resume
+from tcgsplat.cli.scoring import scored
+from tcgsplat.cli.summary import versions
+from tcgsplat.config import from_toml
+from tcgsplat.datasets.synthetic import synthesize
+from tcgsplat.errors import ArchiveError, TCGSplatError
+from tcgsplat.evaluation.metrics import Metric, Report
+from tcgsplat.render.backends import open_rasterizer
+from tcgsplat.storage import atomic
+from tcgsplat.storage.run_directory import RunDirectory
+
+logger = logging.getLogger(__name__)
+
+State = Literal["done", "lost", "failed", "missing", "waiting"]
+MOST_LOST = 0.5
+"""Share of lost frames above which a run counts as lost: the error of what is left of its path says nothing."""
+KEPT = ("config.toml", "request.json", "summary.json", "report.json", "bench.json", "trajectory.txt", "run.json")
+"""Small files of a run, which a worker on another machine gives back."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run to be made."""
+
+    source: Source
+    folder: Path
+    """Of the frames; of a synthetic sequence it need not be there yet."""
+    preset: str
+    seed: int
+    config_toml: str
+    """All settings, the seed among them."""
+    part: Part = field(default_factory=Part)
+    backend: str = "auto"
+    lpips: Path | None = None
+    """Weights, as for `tcgsplat eval`."""
+
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """Preset, sequence, seed: arm, sequence and seed of `evaluation.paired`."""
+        return self.preset, self.source.name, self.seed
+
+    @property
+    def place(self) -> Path:
+        """Of its run directory, below that of the suite."""
+        return Path("runs") / self.source.slug / self.preset / str(self.seed)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """All that its figures hang on, but for the machine; as JSON has it."""
+        data = asdict(self.source.synth) if self.source.synth else str(self.folder.expanduser().resolve())
+        return {
+            "data": data,
+            "part": asdict(self.part),
+            "backend": self.backend,
+            "lpips": None if self.lpips is None else str(self.lpips),
+            "versions": versions(),
+            "config": self.config_toml,
+        }
+
+    def __str__(self) -> str:
+        """For a person."""
+        return f"{self.source.name}, {self.preset}, seed {self.seed}"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a run."""
+
+    sequence: str
+    preset: str
+    seed: int
+    state: State
+    why: str = ""
+    """In words, where it is not done."""
+    metrics: Mapping[str, Metric] = field(default_factory=dict)
+    absent: Mapping[str, str] = field(default_factory=dict)
+    """Why a metric is not there, by its name."""
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    """Of the run: times by stage, versions, machine."""
+    place: str = ""
+    """Of its run directory, below that of the suite; config.toml in it has its settings in full."""
+
+    @property
+    def key(self) -> tuple[str, str, int]:
+        """As `Job.key`."""
+        return self.preset, self.sequence, self.seed
+
+    def value(self, metric: str) -> float | None:
+        """Of one that counts; None if the run is not done or does not have it."""
+        found = self.metrics.get(metric)
+        return None if found is None or self.state != "done" else float(found.value)
+
+    def to_json(self) -> dict[str, Any]:
+        """For `results.json`."""
+        metrics = {name: {"value": metric.value, "unit": metric.unit} for name, metric in self.metrics.items()}
+        config = f"{self.place}/config.toml" if self.place else None
+        return {**asdict(self), "metrics": metrics, "config": config}
+
+    @staticmethod
+    def without(job: Job, state: State, why: str) -> "Outcome":
+        """Of a run that gave no report."""
+        return Outcome(job.source.name, job.preset, job.seed, state, why, place=job.place.as_posix())
+
+
+def performed(job: Job, path: Path) -> Report:
+    """Run and score a job; what it was resumed from is used where it is of the same job.
+
+    This is `tcgsplat run --resume` and `tcgsplat eval`, in one process; whoever wants to see every step of SLAM puts
+    an observer here.
+
+    Args:
+        job: Its data must be there.
+        path: Its run directory.
+
+    Raises:
+        TCGSplatError: if it cannot be run, or there is nothing to score.
+        KeyboardInterrupt: at Ctrl-C; the frames that were mapped are kept.
+    """
+    config, rasterizer = from_toml(job.config_toml), open_rasterizer(job.backend)  # type: ignore[arg-type]
+    sequence = job.part.open(job.folder)
+    run = _begun(job, path)
+    if not run.summary() or run.summary().get("interrupted"):
+        summary = recorded(sequence, config, rasterizer, run, job.preset)
+        if summary.interrupted:
+            raise KeyboardInterrupt(f"stopped; saved {summary}: {run.path}")
+    return scored(run, sequence, rasterizer, lpips=job.lpips)
+
+
+def _begun(job: Job, path: Path) -> RunDirectory:
+    """The run directory of the same job, finished or not; or a new one in the place of what is there."""
+    config = from_toml(job.config_toml)
+    if _told(path / "bench.json") == job.identity:
+        try:
+            run = RunDirectory.open(path)
+            unfinished = not run.summary() or run.summary().get("interrupted")
+            return resume(path, config, job.folder, job.part) if unfinished else run
+        except ArchiveError as error:
+            logger.warning("%s; it begins anew", error)
+    if path.exists():
+        shutil.rmtree(path)
+    run = begin(path, config, job.folder, job.part, overwrite=False)
+    atomic.write_text(path / "bench.json", json.dumps(job.identity, indent=2) + "\n")
+    return run
+
+
+def attempted(job: Job, out: Path) -> Outcome:
+    """What comes of a job; a failure of our own is an outcome too.
+
+    Raises:
+        KeyboardInterrupt: at Ctrl-C.
+    """
+    path = out / job.place
+    try:
+        performed(job, path)
+    except TCGSplatError as error:
+        return Outcome.without(job, "failed", str(error))
+    outcome = finished(job, out)
+    return outcome or Outcome.without(job, "failed", f"{path} has no complete report.json; look there")
+
+
+def finished(job: Job, out: Path) -> Outcome | None:
+    """What came of a job before, with the same settings, data and versions; None if it has to be run."""
+    path = out / job.place
+    if _told(path / "bench.json") != job.identity:
+        return None
+    report, summary = _told(path / "report.json"), _told(path / "summary.json")
+    if not report or not summary or summary.get("interrupted"):
+        return None
+    try:
+        evaluated = report.pop("evaluated")
+        metrics = {name: Metric(one["value"], one["unit"]) for name, one in report.items()}
+        absent = dict(evaluated["missing"])
+        frames, lost = int(summary["frames"]), int(summary["frames_lost"])
+    except (KeyError, TypeError, ValueError):
+        return None
+    too_lost = lost > MOST_LOST * frames
+    return Outcome(
+        *(job.source.name, job.preset, job.seed),
+        state="lost" if too_lost else "done",
+        why=f"tracking was lost in {lost} of {frames} frames" if too_lost else "",
+        metrics=metrics,
+        absent=absent,
+        summary=summary,
+        place=job.place.as_posix(),
+    )
+
+
+def made(job: Job, folder: Path | None = None) -> None:
+    """Make a synthetic sequence where it is not there, or is another one; `folder` if not in the job's own.
+
+    Raises:
+        DatasetError: if something else is in its place.
+    """
+    folder, synth = folder or job.folder, job.source.synth
+    if synth is None:
+        return
+    told = folder.with_name(f"{folder.name}.json")
+    if folder.exists() and _told(told) == asdict(synth):
+        return
+    if folder.exists() and told.exists():  # ours, of another configuration
+        told.unlink()
+        shutil.rmtree(folder)
+    with counting(f"{job.source.name}: frame") as progress:
+        synthesize(folder, synth, progress)
+    atomic.write_text(told, json.dumps(asdict(synth), indent=2) + "\n")
+
+
+def _told(path: Path) -> dict[str, Any]:
+    """The object in a JSON file; empty if there is none that can be read."""
+    try:
+        written = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return written if isinstance(written, dict) else {}
