@@ -125,11 +125,11 @@ def test_a_mesh_agrees_with_itself(
     a, b, c = size
     T = pose(*place, degrees=angles)
     mesh = box((-a, -b, -c), (a, b, c)).moved(T)
-    config = replace(FEW, points=1000, virtual_views=3, icp=icp, seed=seed)
+    config = replace(FEW, points=1000, virtual_views=8, icp=icp, seed=seed)
     score = surface_metrics(mesh, mesh, Views(CAMERA, [T @ T_box_cam for T_box_cam in ALL_AROUND]), config)
     assert max(score.accuracy, score.completion, score.depth_l1) < 1e-5
     assert score.precision == score.recall == score.f1 == score.completion_ratio == score.depth_coverage == 1.0
-    assert score.virtual_views == 3 and 0.5 < score.seen <= 1.0
+    assert 1 <= score.virtual_views <= 8 and 0.4 < score.seen <= 1.0
 
 
 def test_the_same_seed_gives_the_same_score_and_another_nearly() -> None:
@@ -221,7 +221,7 @@ def test_a_run_is_fused_aligned_and_scored(run: RunDirectory, rasterizer: Raster
         config=FEW,
         progress=lambda done, total: told.append((done, total)),
     )
-    assert told == [(1, 3), (2, 3), (3, 3)] and mesh.confidence is not None
+    assert told == [(i, 6) for i in range(1, 7)] and mesh.confidence is not None
     assert score.accuracy < 0.004 and score.precision > 0.95
     assert score.recall > 0.85 and score.completion < 0.01 and score.depth_l1 < 0.02
     away = torch.from_numpy(mesh.vertices) - T[:3, 3]

@@ -1,4 +1,4 @@
-"""From a map of Gaussians to a surface: depth as the keyframes would see it, fused in a truncated signed distance grid.
+"""From a map of Gaussians to a surface: depth as keyframes would see it, fused in a truncated signed distance grid.
 
 Gaussians have no surface of their own. What they show from the keyframes has one, and where views disagree by a little
 the grid takes their mean (Curless and Levoy 1996). The grid is Open3D's `VoxelBlockGrid`, which is not among what
@@ -28,6 +28,8 @@ _BLOCK = 8
 """Voxels along the edge of a block: half of Open3D's usual, as walls are thin and a block is allocated whole."""
 _BLOCKS = 20_000
 """To begin with; the grid grows by itself."""
+
+_Surface = tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"], Float[np.ndarray, "v 3"]]
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def fused(
         submap: With its keyframes: a submap, or the one map of a run (`storage.world_map`).
         rasterizer: Backend.
         config: How.
-        progress: Told how many views of how many are fused.
+        progress: Told how many views of how many are fused; each is fused twice.
 
     Returns:
         The mesh in the submap's frame; without triangles if too little was seen.
@@ -99,20 +101,23 @@ def fused(
     Raises:
         BackendUnavailableError: if Open3D cannot be imported.
     """
-    config = config or FusionConfig()
-    grids = _Grid(config), _Grid(config)
-    view = SubmapView(submap, rasterizer)
-    for number, keyframe in enumerate(submap.keyframes, start=1):
-        camera, rendering = keyframe.frame.camera, view(keyframe.frame.camera, keyframe.T_map_cam)
-        depth = surface_depth(rendering, config)
-        coverage = rendering.alpha.clamp_min(1e-3)[..., None]
-        confidence = rendering.confidence[..., None].expand(*depth.shape, 3)
-        for grid, painted in zip(grids, (rendering.color, confidence), strict=True):
-            grid.integrate(depth, (painted / coverage).clamp(0.0, 1.0), camera, keyframe.T_map_cam)
-        if progress is not None:
-            progress(number, len(submap.keyframes))
-    (vertices, triangles, colors), (_, _, confidences) = (grid.surface() for grid in grids)
-    mesh = Mesh(vertices, triangles, np.round(255.0 * colors).astype(np.uint8), confidences[:, 0])
+    config, view = config or FusionConfig(), SubmapView(submap, rasterizer)
+    cameras = [(keyframe.frame.camera, keyframe.T_map_cam) for keyframe in submap.keyframes]
+
+    def painted(paint: Callable[[Rendering], Float[torch.Tensor, "h w c"]], done: int) -> _Surface:
+        """Drawn anew for each paint: a second grid at the same time would take more than drawing does."""
+        grid = _Grid(config)
+        for number, (camera, T_map_cam) in enumerate(cameras, start=done + 1):
+            rendering = view(camera, T_map_cam)
+            channels = (paint(rendering) / rendering.alpha.clamp_min(1e-3)[..., None]).clamp(0.0, 1.0)
+            grid.integrate(surface_depth(rendering, config), channels.expand(-1, -1, 3), camera, T_map_cam)
+            if progress is not None:
+                progress(number, 2 * len(cameras))
+        return grid.surface()
+
+    vertices, triangles, colors = painted(lambda rendering: rendering.color, 0)
+    _, _, confidence = painted(lambda rendering: rendering.confidence[..., None], len(cameras))
+    mesh = Mesh(vertices, triangles, np.round(255.0 * colors).astype(np.uint8), confidence[:, 0])
     return _large_pieces(mesh, config.min_piece)
 
 
@@ -177,7 +182,7 @@ class _Grid:
         blocks = self._grid.compute_unique_block_coordinates(cloud, limits[2])
         self._grid.integrate(blocks, *planes, intrinsics, extrinsics, *limits)
 
-    def surface(self) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"], Float[np.ndarray, "v 3"]]:
+    def surface(self) -> _Surface:
         """Vertices (metres), triangles and channels, in the order of the coordinates: Open3D's depends on threads."""
         mesh = self._grid.extract_triangle_mesh(self._config.min_views - 0.5) if self._grid.hashmap().size() else None
         if mesh is None or "indices" not in mesh.triangle:
