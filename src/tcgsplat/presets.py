@@ -133,6 +133,7 @@ _PUBLISHED: tuple[tuple[str, _Three, Origin, str], ...] = (
     ("schedule.submap_angle", _same(50.0), "paper", "degrees; Section 4.1"),
     ("schedule.submap_interval", _same(50), "paper", "frames, on ScanNet; Section 4.1"),
     ("schedule.withhold_every", _same(0), "paper", "every frame may be mapped"),
+    ("confidence.model", _same("paper"), "paper", "equations 4 to 16"),
     ("confidence.p_min", _same(0.1), "ours", "no tracking weight below 0.28, and p spans ten to one"),
     ("confidence.initial", _same(0.3), "ours", "new surface counts half of mature surface in tracking"),
     ("confidence.decay_time", (40.0, 100.0, 100.0), "ours", "updates: about twice those of a submap, 20 on Replica"),

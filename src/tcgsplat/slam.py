@@ -139,7 +139,7 @@ class Slam:
         self.delay = DepthDelay()
         self.lost = 0
         self.submap = self._anchored(se3.identity(), index=0)
-        self._reference = Reference(self.submap)
+        self.reference = Reference(self.submap)
         self.atlas = Atlas().with_submap(self.submap.T_world_map)
         self.trajectory = Trajectory()
         self.closures: tuple[Closure, ...] = ()
@@ -153,7 +153,7 @@ class Slam:
         slam, then = Slam(config, rasterizer, store=store), checkpoint
         slam.trajectory, slam.atlas, slam.motion, slam.delay = then.trajectory, then.atlas, then.motion, then.delay
         slam.submap = slam._anchored(then.atlas.T_world_map[then.sealed], index=then.sealed)
-        slam._reference = Reference(measured(store.load_submap(then.reference)), then.T_map_reference, then.exposure)
+        slam.reference = Reference(measured(store.load_submap(then.reference)), then.T_map_reference, then.exposure)
         slam._ids.next, slam._resumed_at = then.next_id, then.frame_index
         slam._generator.set_state(then.generator)
         if config.loop.enabled:
@@ -214,11 +214,11 @@ class Slam:
                 keyframe = Keyframe(self._synchronized(frame), T_map_cam, exposure.relaxed(EXPOSURE_LEAK))
                 grown = self._mapper.grown(keyframe, self.submap)
             self.submap, self._since_mapped = grown.submap, 0
-            if not grown.first or not len(self._reference.submap):
+            if not grown.first or not len(self.reference.submap):
                 self._refer_to(self.submap)
             self._updating = self._mapping_thread.submit(self._updated, grown)
             clock.lap("grow")
-            raw = grown.first and self._reference.submap is self.submap  # one picture's seeds are all there is
+            raw = grown.first and self.reference.submap is self.submap  # one picture's seeds are all there is
             if (raw or self.config.schedule.map_lag == 0) and not self._live:
                 update = self._finished_update()
                 clock.lap("wait")
@@ -283,7 +283,7 @@ class Slam:
 
     def _tracked(self, frame: Frame, guess: Pose) -> Tracked:
         """The frame's pose and exposure in the active submap, found in the reference."""
-        reference = self._reference
+        reference = self.reference
         T_map_reference = reference.T_map_reference
         tracked = self._tracker.track(frame, reference.submap, se3.inverse(T_map_reference) @ guess)
         return replace(
@@ -300,7 +300,7 @@ class Slam:
         self.submap = self._anchored(self.atlas.T_world_map[reference.index] @ tracked.T_map_cam, index)
         self.atlas = self.atlas.with_submap(self.submap.T_world_map)
         self.motion = self.motion.rebased()
-        self._reference = Reference(reference, se3.inverse(tracked.T_map_cam), tracked.exposure)
+        self.reference = Reference(reference, se3.inverse(tracked.T_map_cam), tracked.exposure)
         checkpoint = Checkpoint(
             frame_index=frame_index,
             sealed=index,
@@ -310,8 +310,8 @@ class Slam:
             motion=self.motion,
             delay=self.delay,
             reference=reference.index,
-            T_map_reference=self._reference.T_map_reference,
-            exposure=self._reference.exposure,
+            T_map_reference=self.reference.T_map_reference,
+            exposure=self.reference.exposure,
             next_id=self._ids.next,
             generator=self._generator.get_state(),
             exact=not self._live,
@@ -386,7 +386,7 @@ class Slam:
     def _refer_to(self, submap: Submap) -> None:
         """Track against the active submap from now on, if there is anything in it."""
         if len(submap):
-            self._reference = Reference(submap)
+            self.reference = Reference(submap)
 
     def _anchored(self, T_world_map: torch.Tensor, index: int) -> Submap:
         return Submap.anchored(T_world_map, index, self.config.mapper.sh_degree, self._device)

@@ -9,6 +9,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from tcgsplat.confidence import equations as eq
+from tcgsplat.confidence import expectation
 from tcgsplat.errors import ConfigError
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag
 
@@ -24,6 +25,25 @@ class ConfidenceConfig:
     5.0 mm after 100 steps, 1.8 and 2.4 after 20, 1.3 and 1.7 after 10. `for_updates_of` scales the four lengths.
     """
 
+    model: Literal["expectation", "paper"] = "expectation"
+    """Where confidence comes from [ours]: `expectation`, the depth error that is to be expected of a Gaussian, from its
+    reading and from what later frames showed before they were used (`confidence/expectation.py`); `paper`, equations 4
+    to 16."""
+    error_ref: float = 0.1
+    """Expected error at which half of the confidence above the floor is gone, metres [ours]: well above what a sensor's
+    noise explains (2.6 cm at 4 m), which tracking allows for by itself, and well below a wrong surface."""
+    error_max: float = 0.5
+    """No error counts for more, metres [ours]: a wrong surface is wrong, by however much."""
+    error_memory: float = 0.9
+    """What is left of the evidence after another frame that shows a Gaussian, in (0, 1] [ours]: it remembers ten
+    mapped frames, as `baseline_rate` does, so that what has begun to move is soon found out."""
+    error_prior: float = 4.0
+    """Pixels that the error of the reading counts for at birth [ours]: a few, as the reading is one, so that the first
+    frame that draws the Gaussian decides as much."""
+    noise_floor: float = 0.0017
+    """Depth noise at 0.4 m, metres [ours]: a structured-light sensor's (Nguyen et al. 2012), as in tracking."""
+    noise_slope: float = 0.0019
+    """Growth of depth noise with the square of the distance beyond 0.4 m, 1/metre [ours]: as in tracking."""
     p_min: float = 0.1
     """p_min, unitless, in (0, 1) [ours]: no pixel's tracking weight falls below 0.28, and p spans ten to one."""
     initial: float = 0.3
@@ -94,7 +114,8 @@ class ConfidenceConfig:
         self._require("p_min", 0 < self.p_min < 1, "above 0 and below 1")
         self._require("initial", self.p_min <= self.initial <= 1, f"between p_min ({self.p_min:g}) and 1")
         self._require("decay_time", self.decay_time > 0, "above 0 mapping updates (inf for no decay)")
-        for name in ("residual_ref", "distance_ref", "stability_scale", "maturity_time"):
+        self._require("model", self.model in ("expectation", "paper"), '"expectation" or "paper"')
+        for name in ("residual_ref", "distance_ref", "stability_scale", "maturity_time", "error_ref", "error_max"):
             self._require(name, 0 < getattr(self, name) < math.inf, "above 0 and finite")
         for name in (
             "scale_change_weight",
@@ -106,9 +127,12 @@ class ConfidenceConfig:
             "stability_weight",
             "slack_min",
             "step_scale_min",
+            "error_prior",
+            "noise_floor",
+            "noise_slope",
         ):
             self._require(name, 0 <= getattr(self, name) < math.inf, "at least 0 and finite")
-        for name in ("update_rate", "baseline_rate", "tracking_floor"):
+        for name in ("update_rate", "baseline_rate", "tracking_floor", "error_memory"):
             self._require(name, 0 < getattr(self, name) <= 1, "above 0 and at most 1")
         self._require("view_floor", 0 <= self.view_floor <= 1, "between 0 and 1")
         for name in ("slack", "step_scale"):
@@ -159,6 +183,10 @@ class ConfidenceState:
     """b: mapping updates of the submap before this Gaussian was created."""
     updates: Int[Tensor, " n"]
     """n_EMA: valid observations so far."""
+    expected_error: PerGaussian
+    """Of depth, metres; 0 where nothing is known."""
+    evidence: PerGaussian
+    """Pixels that the expected error rests on."""
 
     def __len__(self) -> int:
         return int(self.value.shape[0])
@@ -168,18 +196,40 @@ class ConfidenceState:
         """Of no Gaussians yet."""
         nothing = torch.zeros(0, device=device)
         none = torch.zeros(0, dtype=torch.int64, device=device)
-        return ConfidenceState(value=nothing, baseline=nothing, born=none, updates=none)
+        return ConfidenceState(
+            value=nothing, baseline=nothing, born=none, updates=none, expected_error=nothing, evidence=nothing
+        )
 
     @staticmethod
     def born_at(
-        clock: int, n: int, config: ConfidenceConfig, *, device: torch.device | None = None
+        clock: int,
+        n: int,
+        config: ConfidenceConfig,
+        *,
+        expected_error: PerGaussian | None = None,
+        device: torch.device | None = None,
     ) -> "ConfidenceState":
-        """Of `n` Gaussians created after `clock` mapping updates of their submap, not yet observed."""
+        """Of `n` Gaussians created after `clock` mapping updates of their submap, not yet observed.
+
+        Args:
+            clock: Mapping updates.
+            n: How many.
+            config: For their first confidence.
+            expected_error: Of each one's depth, metres; if it is not known, confidence begins at `initial`.
+            device: Of the state.
+        """
+        value, evidence = torch.full((n,), config.initial, device=device), torch.zeros(n, device=device)
+        error = torch.zeros(n, device=device)
+        if expected_error is not None and config.model == "expectation":
+            error, evidence = expected_error.to(error), torch.full_like(evidence, config.error_prior)
+            value = expectation.confidence(error, error_ref=config.error_ref, p_min=config.p_min)
         return ConfidenceState(
-            value=torch.full((n,), config.initial, device=device),
+            value=value,
             baseline=torch.zeros(n, device=device),
             born=torch.full((n,), clock, dtype=torch.int64, device=device),
             updates=torch.zeros(n, dtype=torch.int64, device=device),
+            expected_error=error,
+            evidence=evidence,
         )
 
     @property
@@ -202,11 +252,32 @@ class ConfidenceState:
         return ConfidenceState(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
     @torch.no_grad()
+    def experienced(self, pixels: PerGaussian, errors: PerGaussian, config: ConfidenceConfig) -> "ConfidenceState":
+        """After a frame that the map had not seen: how far off was what each Gaussian is part of.
+
+        Nothing changes with the paper's model.
+
+        Args:
+            pixels: In which a Gaussian was drawn and the depth could be compared, counted by its weight in each.
+            errors: Depth errors there, weighted alike, metres times pixels.
+            config: The model and its constants.
+        """
+        if config.model == "paper":
+            return self
+        error, evidence = expectation.remembered(
+            self.expected_error, self.evidence, pixels, errors, memory=config.error_memory
+        )
+        value = expectation.confidence(error, error_ref=config.error_ref, p_min=config.p_min)
+        known = torch.where(evidence > 0, value, self.value)
+        return replace(self, value=known, expected_error=error, evidence=evidence)
+
+    @torch.no_grad()
     def observed(self, observation: Observation, config: ConfidenceConfig) -> "ConfidenceState":
         """After one more mapping update: all fade, and what was seen is rewarded or penalised (Eqs. 4, 10 to 15).
 
         Call it once for every mapping update, whether anything was seen or not. Rows whose distance or residual is
-        not a number count as not seen.
+        not a number count as not seen. Only the paper's model changes confidence here; the average of the
+        self-distance, which the stability loss needs, moves on in both.
         """
         distance, residual = observation.distance, observation.residual
         seen = observation.valid & ~distance.isnan() & ~residual.isnan()  # one NaN in p would never leave the map
@@ -231,14 +302,19 @@ class ConfidenceState:
         averaged = eq.update_baseline(self.baseline, distance, rate=config.baseline_rate)
         return replace(
             self,
-            value=torch.where(seen, judged, decayed),
+            value=torch.where(seen, judged, decayed) if config.model == "paper" else self.value,
             baseline=torch.where(seen, torch.where(first, distance, averaged), self.baseline),
             updates=self.updates + seen,
         )
 
     @torch.no_grad()
     def sealed(self, config: ConfidenceConfig) -> "ConfidenceState":
-        """Calibrated for unequal ages at the end of the submap (Eq. 16); once, as a second time would decay again."""
+        """Calibrated for unequal ages at the end of the submap (Eq. 16); once, as a second time would decay again.
+
+        An expected error does not depend on age: with that model nothing changes.
+        """
+        if config.model == "expectation":
+            return self
         return replace(
             self, value=eq.calibrate_age(self.value, self.born, decay_time=config.decay_time, p_min=config.p_min)
         )

@@ -4,17 +4,20 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from tcgsplat.confidence import equations as eq
+from tcgsplat.confidence.expectation import reading_error
 from tcgsplat.confidence.state import ConfidenceConfig
+from tcgsplat.geometry import se3
 from tcgsplat.mapping.keyframes import thinned
 from tcgsplat.mapping.optimization import Optimization, begin
 from tcgsplat.mapping.seeding import IdSource, seed
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.render.view import Rendering, render_view
+from tcgsplat.render.view import Rendering, blended, render_view
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
-from tcgsplat.tensors import PerGaussian
+from tcgsplat.tensors import PerGaussian, Plane
 
 
 @dataclass(frozen=True)
@@ -26,6 +29,10 @@ class Grown:
     seeded: int
     first: bool
     """It is the submap's first frame."""
+    before: Submap
+    """As it was before it took in the frame."""
+    rendering: Rendering | None
+    """The frame's view of that; None of an empty map."""
 
     @property
     def frame(self) -> Frame:
@@ -76,14 +83,16 @@ class Mapper:
         first, frame, T_map_cam = not submap.keyframes, keyframe.balanced, keyframe.T_map_cam
         rendering = None if first else render_view(submap, frame.camera, T_map_cam, self._rasterizer)
         seeds = seed(frame, T_map_cam, rendering, submap.gaussians, self._ids, self._generator, self._config.seeding)
+        pixels = frame.camera.project(se3.transform(se3.inverse(T_map_cam), seeds.means))
+        doubt = eq.sample_at(birth_error(frame, rendering, self._confidence), pixels)
         keyframes = thinned((*submap.keyframes, keyframe), self._config.max_keyframes)
-        grown = replace(submap.grown(seeds, self._confidence), keyframes=keyframes)
-        return Grown(grown, len(seeds), first)
+        grown = replace(submap.grown(seeds, self._confidence, doubt), keyframes=keyframes)
+        return Grown(grown, len(seeds), first, submap, rendering)
 
     def optimized(self, grown: Grown) -> Mapped:
         """The grown submap, optimised over its keyframes."""
         iterations = self._config.first_iterations if grown.first else self._config.iterations
-        optimization = self._optimized(grown.submap, iterations)
+        optimization = self._optimized(experienced(grown, self._confidence, self._rasterizer), iterations)
         submap = optimization.submap()
         newest = submap.keyframes[-1]
         rendering = render_view(submap, newest.frame.camera, newest.T_map_cam, self._rasterizer)
@@ -105,3 +114,42 @@ class Mapper:
         if count == 1 or float(torch.rand((), generator=self._generator)) < self._config.current_share:
             return count - 1
         return int(torch.randint(count - 1, (), generator=self._generator))
+
+
+def birth_error(frame: Frame, rendering: Rendering | None, config: ConfidenceConfig) -> Plane:
+    """The depth error to expect of what is made of each reading, metres.
+
+    It is that of the reading; and where the map shows a surface behind it, as far behind as that: either of them is
+    wrong, or something has come into the picture and may go again.
+
+    Args:
+        frame: That is taken into the map.
+        rendering: Its view of the map before; None of an empty one.
+        config: Of the sensor's noise.
+    """
+    largest = config.error_max
+    own = reading_error(frame.depth, noise_floor=config.noise_floor, noise_slope=config.noise_slope, largest=largest)
+    if rendering is None:
+        return own
+    behind = torch.where((rendering.depth > 0) & (frame.depth > 0), rendering.depth - frame.depth, 0.0)
+    return torch.maximum(own, behind).clamp_max(largest)
+
+
+@torch.no_grad()
+def experienced(grown: Grown, config: ConfidenceConfig, rasterizer: Rasterizer) -> Submap:
+    """The grown submap, having been told how far off its older Gaussians were where the frame shows them.
+
+    The frame has not been used by then: what is found here is what tracking would have found, had it known the truth.
+    """
+    if grown.rendering is None or config.model == "paper":
+        return grown.submap
+    frame, depth = grown.frame, grown.rendering.depth
+    compared = frame.valid & (frame.depth > 0) & (depth > 0)
+    error = torch.where(compared, (depth - frame.depth).abs().clamp_max(config.error_max), 0.0)
+    images = torch.stack((compared.to(error), error), dim=-1)
+    pixels, errors = blended(
+        grown.before, images, frame.camera, grown.submap.keyframes[-1].T_map_cam, rasterizer
+    ).unbind(-1)
+    born = torch.zeros(len(grown.submap) - len(grown.before), device=pixels.device)
+    state = grown.submap.confidence.experienced(torch.cat((pixels, born)), torch.cat((errors, born)), config)
+    return replace(grown.submap, confidence=state)

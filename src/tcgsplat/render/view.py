@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
@@ -95,6 +97,27 @@ class SubmapView:
         if submap.gaussians.sh_degree == 0:  # else colours depend on where they are seen from
             self._splats = splats
         return _drawn(splats, camera, T_cam_map, self._rasterizer)
+
+
+def blended(
+    submap: Submap,
+    images: Float[Tensor, "h w c"],
+    camera: Camera,
+    T_map_cam: Pose,
+    rasterizer: Rasterizer,
+) -> Float[Tensor, "n c"]:
+    """For each Gaussian the sum over all pixels of some images, times its weight T alpha in each pixel's blend.
+
+    This is drawing turned round: what a picture says, handed to those that it shows, and to none that they hide.
+    """
+    gaussians = submap.gaussians
+    features = torch.zeros(len(gaussians), images.shape[-1], device=images.device, requires_grad=True)
+    opacities = gaussians.opacities.clamp_max(MAX_OPACITY)
+    with torch.enable_grad():
+        splats = Splats(gaussians.means, gaussians.quats, gaussians.scales, opacities, features)
+        drawn = rasterizer(splats, camera, se3.inverse(T_map_cam)).features
+    (weighed,) = torch.autograd.grad(drawn, features, images)
+    return weighed
 
 
 def _splats(gaussians: Gaussians, confidence: PerGaussian, T_cam_map: Pose) -> Splats:

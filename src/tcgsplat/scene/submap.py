@@ -13,7 +13,7 @@ from tcgsplat.geometry import se3
 from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
-from tcgsplat.tensors import PerGaussianFlag, Pose
+from tcgsplat.tensors import PerGaussian, PerGaussianFlag, Pose
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,11 @@ class Submap:
     def __len__(self) -> int:
         return len(self.gaussians)
 
-    def grown(self, new: Gaussians, config: ConfidenceConfig) -> "Submap":
-        """With new Gaussians appended; their confidence is born at this submap's clock."""
-        born = ConfidenceState.born_at(self.clock, len(new), config, device=new.means.device)
+    def grown(self, new: Gaussians, config: ConfidenceConfig, expected_error: PerGaussian | None = None) -> "Submap":
+        """With new Gaussians appended; their confidence is born at this submap's clock (see `born_at`)."""
+        born = ConfidenceState.born_at(
+            self.clock, len(new), config, expected_error=expected_error, device=new.means.device
+        )
         return replace(self, gaussians=self.gaussians.appended(new), confidence=self.confidence.appended(born))
 
     def kept(self, keep: PerGaussianFlag) -> "Submap":

@@ -163,11 +163,18 @@ def unpack_submap(path: Path, arrays: Mapping[str, Array]) -> Submap:
             index=int(arrays["index"]),
             T_world_map=torch.from_numpy(arrays["T_world_map"]),
             gaussians=Gaussians(**{f.name: torch.from_numpy(arrays[f"gaussians.{f.name}"]) for f in fields(Gaussians)}),
-            confidence=ConfidenceState(
-                **{f.name: torch.from_numpy(arrays[f"confidence.{f.name}"]) for f in fields(ConfidenceState)}
-            ),
+            confidence=ConfidenceState(**_confidence(arrays)),
             clock=int(arrays["clock"]),
         )
+
+
+def _confidence(arrays: Mapping[str, Array]) -> dict[str, Tensor]:
+    columns = {name: f"confidence.{name}" for name in (f.name for f in fields(ConfidenceState))}
+    unknown = np.zeros_like(arrays["confidence.value"])  # an older tcgsplat expected no errors
+    given = dict(arrays) | {
+        columns[name]: arrays.get(columns[name], unknown) for name in ("expected_error", "evidence")
+    }
+    return {name: torch.from_numpy(given[column]) for name, column in columns.items()}
 
 
 def submap_size(path: Path) -> int:

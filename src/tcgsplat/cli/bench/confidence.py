@@ -1,0 +1,343 @@
+"""`tcgsplat bench confidence`: whether confidence is true. Every frame is predicted before it is used."""
+
+import json
+import math
+import statistics
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+
+from tcgsplat.cli.bench import Confidence
+from tcgsplat.cli.kernels import compile_kernels
+from tcgsplat.cli.progress import RunProgress, say
+from tcgsplat.cli.recorder import Part
+from tcgsplat.cli.settings import resolved
+from tcgsplat.cli.summary import machine, versions
+from tcgsplat.config import SlamConfig, to_toml, with_settings
+from tcgsplat.datasets.truth import Event, Truth
+from tcgsplat.errors import EvaluationError
+from tcgsplat.evaluation import ate
+from tcgsplat.evaluation.prediction import OURS, OVER_OPACITY, Judged, Seen, claim, of_color, of_depth, seen
+from tcgsplat.evaluation.reaction import reaction
+from tcgsplat.evaluation.uncertainty import Reliability, Scores, Sparsification, auroc, calibrated, reliability
+from tcgsplat.evaluation.uncertainty_plots import reliability_plot, sparsification_plot, write
+from tcgsplat.geometry import se3
+from tcgsplat.render.backends import open_rasterizer
+from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.scene.frame import Frame
+from tcgsplat.slam import Reference, Slam, StepReport
+from tcgsplat.storage import atomic
+from tcgsplat.storage.store import InMemory
+from tcgsplat.tensors import Mask, Pose
+
+MODELS: Final = ("expectation", "paper")
+"""Models of confidence that are compared; the first is the default."""
+SHOWN: Final = ("shuffled", "opacity", "observations", "previous residual", "depth edge")
+"""Of the other measures, in the plot."""
+ENOUGH: Final = 50
+"""Pixels that a fault must have in a picture to be looked for."""
+
+
+@dataclass
+class Predictions:
+    """What was claimed of the frames of one way through a sequence, and how it turned out."""
+
+    depth: list[Judged] = field(default_factory=list)
+    color: list[Judged] = field(default_factory=list)
+    mean: dict[int, float] = field(default_factory=dict)
+    """Rendered confidence over opacity, by frame index: mean over what is mapped."""
+    fault_auroc: list[float] = field(default_factory=list)
+    """Of doubt, in telling the pixels of a known fault from all others, once the frame has been used."""
+
+
+class Observer:
+    """Predicts every so many-th frame of a run from what the system knew before the frame came."""
+
+    def __init__(self, truth: Truth, config: SlamConfig, rasterizer: Rasterizer, every: int) -> None:
+        self.found = Predictions()
+        self._truth, self._config, self._rasterizer, self._every = truth, config, rasterizer, every
+        self._rng = np.random.default_rng(config.seed)
+        self._previous: Seen | None = None
+        self._used: tuple[Frame, Mask | None, Pose, int] | None = None
+
+    def observe(self, frame: Frame, before: Reference, after: Reference, report: StepReport) -> None:
+        """After a step: `before` is what the frame was tracked against, `after` what the next one will be."""
+        due = frame.index % self._every == 0 and report.tracked.converged and report.sealed is None
+        if not due or not len(before.submap):
+            return
+        T_map_cam = se3.inverse(before.T_map_reference) @ report.tracked.T_map_cam
+        claimed = claim(
+            before.submap, frame.camera, T_map_cam, self._rasterizer, self._config.confidence, self._rng, self._previous
+        )
+        self._previous = seen(claimed, frame.depth, T_map_cam, before.submap.index)
+        true_depth, fault = self._truth.depth(frame.index), self._truth.fault(frame.index)
+        right = frame.valid if fault is None else frame.valid & ~fault
+        if true_depth is not None:
+            self.found.depth.append(of_depth(claimed, true_depth, frame.valid, self._rng))
+        shown = report.tracked.exposure.applied(before.exposure.applied(claimed.rendering.color))
+        self.found.color.append(of_color(claimed, shown.clamp(0, 1), frame.color, right, self._rng))
+        if self._used is not None and self._used[-1] == after.submap.index:
+            self._follow(after, *self._used[:-1])
+        self._used = frame, fault, se3.inverse(after.T_map_reference) @ report.tracked.T_map_cam, after.submap.index
+
+    def _follow(self, after: Reference, frame: Frame, fault: Mask | None, T_map_cam: Pose) -> None:
+        """What the map says of an earlier view, whose frame it has used by now."""
+        claimed = claim(after.submap, frame.camera, T_map_cam, self._rasterizer, self._config.confidence, self._rng)
+        doubt, mapped = claimed.doubt[OVER_OPACITY], claimed.rendering.depth > 0
+        if not bool(mapped.any()):
+            return
+        self.found.mean[frame.index] = 1.0 - float(doubt[mapped].mean())
+        if fault is not None and int((fault & mapped).sum()) >= ENOUGH:
+            self.found.fault_auroc.append(auroc(doubt[mapped].numpy().astype(np.float64), fault[mapped].numpy()))
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One way through one sequence."""
+
+    sequence: str
+    model: str
+    seed: int
+    ate_rmse_cm: float | None
+    depth: Mapping[str, Mapping[str, float | None]]
+    """By measure: `ause` (0 oracle, 1 random), `spearman` (median of the frames), `spearman_p10`, `partial_spearman`,
+    `auroc` of bad pixels."""
+    color: Mapping[str, Mapping[str, float | None]]
+    kept_back: Mapping[str, Mapping[str, float | None]]
+    """As `depth`, of frames that were never mapped, in the finished submaps."""
+    fault_auroc: float | None
+    """Of doubt, in telling the pixels of a known fault."""
+    events: Sequence[Mapping[str, object]]
+    """Of the sequence, with what confidence did: `before`, `lowest`, `time_to_drop`, `time_to_recover`, `change`."""
+
+
+def command(args: Confidence, settings: Mapping[str, str]) -> int:
+    """Predict, judge, and write the page."""
+    config = resolved(args.preset, args.config, settings, args.seed)
+    rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
+    out = args.out or Path("runs") / "confidence"
+    out.mkdir(parents=True, exist_ok=True)
+    arms: list[Arm] = []
+    judged: dict[str, dict[str, list[Judged]]] = {model: {} for model in MODELS}
+    for folder in args.folders:
+        for model in MODELS:
+            say(f"{folder.name}, model {model}")
+            arm, found = performed(folder, with_settings(config, {"confidence.model": model}), rasterizer, args.every)
+            arms.append(arm)
+            judged[model][arm.sequence] = found.depth
+    calibration = calibration_errors(judged[MODELS[0]])
+    about = f"{rasterizer.name}, preset {args.preset}, seed {config.seed}; {machine()}"
+    _draw(out, judged)
+    page = written(arms, calibration, about)
+    atomic.write_text(out / "README.md", page)
+    content = {
+        "arms": [asdict(arm) for arm in arms], "calibration": calibration, "machine": machine(),
+        "versions": versions(), "config": to_toml(config),
+    }  # fmt: skip
+    atomic.write_text(out / "confidence.json", json.dumps(content, indent=2, allow_nan=False) + "\n")
+    sys.stdout.write(f"{page}\n{out / 'README.md'}, {out / 'confidence.json'}\n")
+    return 0
+
+
+def performed(folder: Path, config: SlamConfig, rasterizer: Rasterizer, every: int) -> tuple[Arm, Predictions]:
+    """The whole system through a sequence, watched.
+
+    Raises:
+        EvaluationError: if nobody knows the truth of the sequence.
+    """
+    truth = Truth.of(folder)
+    if truth is None:
+        raise EvaluationError(f"{folder} has no folder `truth`: exact depth is needed; `tcgsplat synth` makes it")
+    torch.set_num_threads(1)  # as in a run
+    compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
+    store = InMemory()
+    slam, observer = Slam(config, rasterizer, store=store), Observer(truth, config, rasterizer, every)
+    sequence = Part().open(folder)
+    with RunProgress(len(sequence)) as progress:
+        for frame in sequence:
+            before = slam.reference
+            report = slam.step(frame)
+            observer.observe(frame, before, slam.reference, report)
+            progress.observe(report)
+    slam.finish()
+    found, poses = observer.found, sequence.ground_truth()
+    world = {row.frame_index: T for row, T in zip(slam.trajectory.rows, slam.trajectory.world(slam.atlas), strict=True)}
+    common = [index for index in world if index in poses]
+    error = ate.ate_rmse_of_poses([world[i] for i in common], [poses[i] for i in common]) if len(common) > 2 else None
+    rng = np.random.default_rng(config.seed)
+    kept_back = []
+    for row in [row for row in slam.trajectory.rows if not (row.mapped or row.lost)][:: 2 * every]:
+        frame, depth = sequence.frame(row.frame_index), truth.depth(row.frame_index)
+        submap = store.load_submap(row.submap_index)
+        claimed = claim(submap, frame.camera, row.T_map_cam, rasterizer, config.confidence, rng)
+        if depth is not None:
+            kept_back.append(of_depth(claimed, depth, frame.valid, rng))
+    aurocs = [value for value in found.fault_auroc if math.isfinite(value)]
+    arm = Arm(
+        truth.sequence.name,
+        config.confidence.model,
+        config.seed,
+        None if error is None else 100.0 * error,
+        summary(found.depth),
+        summary(found.color),
+        summary(kept_back),
+        statistics.fmean(aurocs) if aurocs else None,
+        [_told(event, found, len(truth.numbers)) for event in truth.events],
+    )
+    return arm, found
+
+
+def _told(event: Event, found: Predictions, frames: int) -> dict[str, object]:
+    """What confidence did about an event: over the region at fault where there is one, else over the image."""
+    values = np.full(frames, np.nan)
+    for index, mean in found.mean.items():
+        values[index] = mean
+    told: dict[str, object] = {"name": event.name, "first": event.first, "last": event.last}
+    during = values[event.first : event.last + 1]
+    known = during[np.isfinite(during)]
+    if len(known) > 1:
+        told["change"] = float(np.mean(known[-3:]) - np.mean(known[:3]))
+    if event.first > 0 and event.last + 1 < frames:
+        what = reaction(values, event.first, event.last + 1)
+        told |= {name: value for name, value in asdict(what).items() if not _is_nan(value)}
+    return told
+
+
+def _is_nan(value: object) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
+def summary(judged: Iterable[Judged]) -> dict[str, dict[str, float | None]]:
+    """Scores of all frames: means, and of the rank correlation the median and the tenth percentile."""
+    by_measure: dict[str, list[Scores]] = {}
+    for one in judged:
+        for name, scores in one.scores.items():
+            by_measure.setdefault(name, []).append(scores)
+
+    def over(values: Iterable[float], reduce: Callable[[list[float]], float]) -> float | None:
+        finite = [value for value in values if math.isfinite(value)]
+        return float(reduce(finite)) if finite else None
+
+    return {
+        name: {
+            "ause": over((one.normalised_ause for one in scores), statistics.fmean),
+            "spearman": over((one.spearman for one in scores), statistics.median),
+            "spearman_p10": over((one.spearman for one in scores), lambda x: float(np.quantile(x, 0.1))),
+            "partial_spearman": over((one.partial_spearman for one in scores), statistics.median),
+            "auroc": over((one.auroc for one in scores), statistics.fmean),
+        }
+        for name, scores in by_measure.items()
+    }
+
+
+def calibration_errors(judged: Mapping[str, Sequence[Judged]]) -> dict[str, float]:
+    """By sequence: the expected calibration error over the mean error, fitted to all the other sequences."""
+    return {name: one.normalised_ece for name, one in _reliabilities(judged).items()}
+
+
+def _reliabilities(judged: Mapping[str, Sequence[Judged]]) -> dict[str, Reliability]:
+    pairs = {
+        name: (np.concatenate([one.doubt for one in frames]), np.concatenate([one.error for one in frames]))
+        for name, frames in judged.items()
+        if frames
+    }
+    found = {}
+    for name, (doubt, error) in pairs.items():
+        others = [pair for other, pair in pairs.items() if other != name]
+        if others:
+            fitted = calibrated(*(np.concatenate(column) for column in zip(*others, strict=True)))
+            found[name] = reliability(fitted.expected_error(doubt), error)
+    return found
+
+
+def _draw(out: Path, judged: Mapping[str, Mapping[str, Sequence[Judged]]]) -> None:
+    """Sparsification of the depth's errors, all sequences together, and the reliability of each sequence."""
+    measures: dict[str, list[Sparsification]] = {}
+    for model in MODELS:
+        for frames in judged[model].values():
+            for one in frames:
+                for name, curve in one.curves.items():
+                    shown = f"{model} model" if name == OURS else name
+                    if name in (OURS, *(SHOWN if model == MODELS[0] else ())):
+                        measures.setdefault(shown, []).append(curve)
+    if measures:
+        title = "Depth error left after the most doubtful pixels are removed; predicted before seen"
+        write(out / "sparsification.png", sparsification_plot(measures, title=title))
+    reliabilities = _reliabilities(judged[MODELS[0]])
+    if reliabilities:
+        title = "Depth error, expectation fitted to the other sequences"
+        write(out / "reliability.png", reliability_plot(reliabilities, title=title))
+
+
+def written(arms: Sequence[Arm], calibration: Mapping[str, float], about: str) -> str:
+    """The page."""
+    first = [arm for arm in arms if arm.model == MODELS[0]]
+    parts = [
+        f"# Is its confidence true?\n\n{about}. Every so many-th frame is drawn from the map as it was before it "
+        "came, at the pose that tracking found, and held against the true depth. AUSE is over that of random: 0 is an "
+        "oracle, 1 knows nothing. Means over frames; of Spearman's correlation the median and the tenth percentile.",
+        "## The two models, depth, predicted before seen\n",
+        _table(
+            ("sequence", "model", "AUSE", "Spearman", "p10", "partial", "AUROC bad", "AUROC fault", "ATE cm"),
+            [
+                (arm.sequence, arm.model, *_cells(arm.depth.get(OURS, {})), _n(arm.fault_auroc, 2), _n(arm.ate_rmse_cm))
+                for arm in arms
+            ],
+        ),
+        "## The same of frames that were never mapped, in the finished map\n",
+        _table(
+            ("sequence", "model", "AUSE", "Spearman", "p10", "partial", "AUROC bad"),
+            [(arm.sequence, arm.model, *_cells(arm.kept_back.get(OURS, {}))) for arm in arms],
+        ),
+        "## Colour, predicted before seen\n",
+        _table(
+            ("sequence", "model", "AUSE", "Spearman", "p10", "partial", "AUROC bad"),
+            [(arm.sequence, arm.model, *_cells(arm.color.get(OURS, {}))) for arm in arms],
+        ),
+        f"## What is to be had for less: AUSE of depth, model {MODELS[0]}\n",
+        _table(
+            ("sequence", *(first[0].depth if first else ())),
+            [(arm.sequence, *(_n(scores.get("ause"), 2) for scores in arm.depth.values())) for arm in first],
+        ),
+        "![sparsification](sparsification.png)\n",
+    ]
+    if calibration:
+        rows = [(name, f"{100 * value:.0f} %") for name, value in calibration.items()]
+        parts += [
+            "## Calibration: error of the expected error, fitted to the other sequences\n",
+            _table(("sequence", "of the mean error"), rows),
+            "![reliability](reliability.png)\n",
+        ]
+    events = [
+        (arm.sequence, arm.model, str(event["name"]), f"{event['first']} to {event['last']}", *_reacted(event))
+        for arm in arms
+        for event in arm.events
+    ]
+    if events:
+        head = ("sequence", "model", "event", "frames", "before", "lowest", "drops after", "back after", "change")
+        parts += ["## What happens, and what confidence does: mean over the picture\n", _table(head, events)]
+    return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
+
+
+def _cells(scores: Mapping[str, float | None]) -> tuple[str, ...]:
+    return tuple(_n(scores.get(name), 2) for name in ("ause", "spearman", "spearman_p10", "partial_spearman", "auroc"))
+
+
+def _reacted(event: Mapping[str, object]) -> tuple[str, ...]:
+    levels = (_n(event.get(name), 2) for name in ("before", "lowest"))
+    times = ("-" if event.get(name) is None else str(event[name]) for name in ("time_to_drop", "time_to_recover"))
+    return (*levels, *times, _n(event.get("change"), 3))
+
+
+def _n(value: object, decimals: int = 3) -> str:
+    return f"{value:.{decimals}f}" if isinstance(value, int | float) else "-"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    rule = ("---",) * 2 + ("---:",) * (len(head) - 2)
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, rule, *rows)) + "\n"
