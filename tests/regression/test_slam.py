@@ -131,7 +131,7 @@ class TestLag:
         """Not where the map that is a lag old has it, which the frames before were tracked against."""
         config = replace(
             CONFIG,
-            tracker=replace(CONFIG.tracker, synchronization="none"),
+            tracker=replace(CONFIG.tracker, synchronization="none", smoothing=False),  # frames as they come
             schedule=replace(CONFIG.schedule, submap_by="interval", submap_interval=6),
             confidence=replace(CONFIG.confidence, guide_tracking=False),  # sealing changes confidence
         )
@@ -262,6 +262,7 @@ class TestBits:
         off = ConfidenceConfig(guide_mapping=False, guide_tracking=False, rerank_views=False)
         wild = replace(
             off,
+            model="paper",
             p_min=0.9,
             initial=0.95,
             decay_time=0.5,

@@ -11,6 +11,7 @@ from tcgsplat.confidence.state import ConfidenceConfig, ConfidenceState, Observa
 from tcgsplat.errors import ConfigError
 
 CONFIG = ConfidenceConfig(
+    model="paper",
     p_min=0.1,
     initial=0.3,
     decay_time=100.0,
@@ -44,7 +45,7 @@ def test_defaults_are_the_papers_where_the_paper_states_them() -> None:
 
 
 def test_no_decay_is_a_valid_setting() -> None:
-    config = ConfidenceConfig(decay_time=math.inf)
+    config = ConfidenceConfig(model="paper", decay_time=math.inf)
     state = ConfidenceState.born_at(3, 2, config)
     close(state.observed(seen([0.0, 0.0], [0.0, 0.0], [False, False]), config).sealed(config).value, 0.3, 0.3)
 
@@ -77,6 +78,13 @@ def test_no_decay_is_a_valid_setting() -> None:
         ("view_floor", 1.1, "between 0 and 1"),
         ("stability_reduction", "max", '"mean" or "sum"'),
         ("step_scale_mode", "adam", '"step" or "gradient"'),
+        ("model", "base", '"expectation" or "paper"'),
+        ("error_ref", 0.0, "above 0 and finite"),
+        ("error_max", math.inf, "above 0 and finite"),
+        ("error_memory", 0.0, "above 0 and at most 1"),
+        ("error_prior", -1.0, "at least 0 and finite"),
+        ("noise_floor", -0.001, "at least 0 and finite"),
+        ("noise_slope", math.inf, "at least 0 and finite"),
     ],
 )
 def test_settings_that_cannot_be_right_are_refused_by_name(name: str, value: object, allowed: str) -> None:

@@ -17,7 +17,7 @@ from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.tensors import Pose
 
-CONFIG = ConfidenceConfig(color_residual_weight=1.0, depth_residual_weight=2.0, p_min=0.1, initial=0.3)
+CONFIG = ConfidenceConfig(model="paper", color_residual_weight=1.0, depth_residual_weight=2.0, p_min=0.1, initial=0.3)
 T_HERE = pose(0.02, 0.01, -0.03, degrees=(1, 4, -2))
 
 
@@ -128,7 +128,8 @@ def test_those_who_explain_the_picture_gain_most(corner: Submap, rasterizer: Ras
     patch = torch.zeros_like(frame.valid)
     patch[8:24, 50:62] = True
     bad = replace(frame, color=torch.where(patch[..., None], 1 - frame.color.round(), frame.color))
-    mapped = update(corner, bad, rasterizer)
+    newborn = replace(corner, confidence=replace(corner.confidence, value=torch.full((len(corner),), CONFIG.initial)))
+    mapped = update(newborn, bad, rasterizer)
     value = judged(mapped, bad, CONFIG, "planar").confidence.value
     hit = inside(pixels_of(corner), 50, 61, 8, 23)
     rest = observation(mapped, bad, CONFIG, "planar").valid & ~inside(pixels_of(corner), 48, 63, 6, 25)

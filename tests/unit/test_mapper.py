@@ -39,7 +39,9 @@ CONFIG = MapperConfig(
     frozen_color_share=0.0,
     max_keyframes=0,
 )
-GUIDED = ConfidenceConfig(guide_mapping=True, p_min=0.1, initial=0.3, step_scale_min=0.8, step_scale_max=1.2)
+GUIDED = ConfidenceConfig(  # the paper's, which leaves confidence alone until an update is judged
+    model="paper", guide_mapping=True, p_min=0.1, initial=0.3, step_scale_min=0.8, step_scale_max=1.2
+)
 UNGUIDED = replace(GUIDED, guide_mapping=False)
 T_SIDE = pose(0.05, 0.02, 0.0, degrees=(0, 12, 0))
 

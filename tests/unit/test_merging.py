@@ -44,7 +44,14 @@ def mapped(index: int, T_world_map: Pose, rasterizer: Rasterizer, exposure: Expo
         submap = mapper.optimized(mapper.grown(Keyframe(frame, T_map_cam), submap)).submap
     n = len(submap)
     value = torch.rand(n, generator=torch.Generator().manual_seed(index)) * 0.2 + 0.4
-    state = ConfidenceState(value, torch.rand(n), torch.arange(n) % 3, torch.arange(n) % 5)
+    state = ConfidenceState(
+        value=value,
+        baseline=torch.rand(n),
+        born=torch.arange(n) % 3,
+        updates=torch.arange(n) % 5,
+        expected_error=torch.rand(n),
+        evidence=torch.rand(n),
+    )
     return replace(submap, clock=3, confidence=state)
 
 

@@ -13,6 +13,8 @@ OURS_EVERYWHERE = {
     "tracker.max_step", "tracker.max_turn", "tracker.min_overlap", "tracker.min_agreement", "tracker.min_correlation",
     "loop.min_coverage", "loop.min_agreement", "loop.min_correlation", "loop.lag", "loop.relocalize_after",
     "mapper.seeding.spacing", "mapper.seeding.footprint", "mapper.seeding.flatness", "mapper.seeding.behind",
+    "confidence.error_ref", "confidence.error_max", "confidence.error_memory", "confidence.error_prior",
+    "confidence.noise_floor", "confidence.noise_slope",
 }  # fmt: skip
 
 
@@ -65,6 +67,7 @@ def test_published_values(path: str, replica: object, tum: object, scannet: obje
 @pytest.mark.parametrize("name", PAPER)
 def test_paper_presets_follow_the_text_and_not_our_default(name: str):
     by_path = {row.path: row for row in origins(name)}
+    assert by_path["confidence.model"].value == "paper"
     assert by_path["confidence.stability_reduction"].value == "mean"
     assert by_path["confidence.step_scale_mode"].value == "gradient"
     assert by_path["confidence.step_scale_mode"].origin == "paper"

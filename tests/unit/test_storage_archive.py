@@ -66,6 +66,8 @@ def random_submap(index: int, generator: torch.Generator, n: int = 17, sh_degree
             baseline=torch.rand(n, generator=generator),
             born=torch.randint(0, 9, (n,), generator=generator),
             updates=torch.randint(0, 9, (n,), generator=generator),
+            expected_error=torch.rand(n, generator=generator),
+            evidence=torch.rand(n, generator=generator),
         ),
         keyframes=tuple(random_keyframe(10 * index + i, generator) for i in range(2)),
         clock=9,
@@ -226,6 +228,25 @@ def test_pictures_of_an_older_run_are_as_they_came(tmp_path: Path, generator: to
         assert torch.equal(keyframe.balanced.color, keyframe.frame.color)
     assert [row.exposure for row in run.trajectory()[0].rows] == [UNCHANGED, UNCHANGED]
     assert torch.equal(run.trajectory()[0].rows[1].T_map_cam, rows[1].T_map_cam)
+
+
+def test_a_submap_of_an_older_run_expects_no_errors(tmp_path: Path, generator: torch.Generator) -> None:
+    submap = random_submap(0, generator)
+    path = tmp_path / "a.npz"
+    archive.write_submap(path, submap)
+    without(path, "submap", ".expected_error", ".evidence")
+    nothing = torch.zeros(len(submap))
+    unknown = dataclasses.replace(submap.confidence, expected_error=nothing, evidence=nothing)
+    assert_same_submap(archive.read_submap(path), dataclasses.replace(submap, confidence=unknown))
+
+
+@pytest.mark.parametrize("column", ["value", "born"])
+def test_no_other_column_of_confidence_may_be_missing(column: str, tmp_path: Path, generator: torch.Generator) -> None:
+    path = tmp_path / "a.npz"
+    archive.write_submap(path, random_submap(0, generator))
+    without(path, "submap", f"confidence.{column}")
+    with pytest.raises(ArchiveError, match=rf"lacks the entry 'confidence\.{column}'"):
+        archive.read_submap(path)
 
 
 def test_trajectory_of_an_older_run_names_no_mapped_frame(tmp_path: Path, generator: torch.Generator) -> None:

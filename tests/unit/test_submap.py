@@ -15,7 +15,7 @@ from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory
 
-CONFIG = ConfidenceConfig(p_min=0.1, initial=0.3, decay_time=20.0)
+CONFIG = ConfidenceConfig(model="paper", p_min=0.1, initial=0.3, decay_time=20.0)
 
 
 def some(count: int, first_id: int) -> Gaussians:
