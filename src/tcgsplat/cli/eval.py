@@ -30,13 +30,18 @@ class Args:
     lpips: Path | None = None
     """Weights for LPIPS: a state dict with AlexNet's `features.N.weight` and `.bias` (torchvision's names) and the
     linear heads `lin0.model.1.weight` to `lin4.model.1.weight`. Without them LPIPS is reported as not available."""
+    surface: bool = False
+    """Also fuse the map to a mesh and compare it with the true one, `mesh.ply` with the data or --true-mesh. Takes a
+    minute or more, and the extra `mesh`."""
+    true_mesh: Path | None = None
+    """The true surface, a PLY in the frame of the true poses."""
     backend: str = "auto"
     """Rasterizer: auto, numba or reference."""
 
 
 def command(args: Args) -> int:
     """Print the report, and put it and the pictures into the run directory."""
-    from tcgsplat.cli.scoring import data_of, scored
+    from tcgsplat.cli.scoring import data_of, scored, true_mesh_of
     from tcgsplat.evaluation.report import score_trajectory
     from tcgsplat.render.backends import open_rasterizer
     from tcgsplat.storage.run_directory import RunDirectory
@@ -56,6 +61,7 @@ def command(args: Args) -> int:
     if run is None:
         raise UsageError("give a run directory, or --trajectory and --sequence")
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
-    report = scored(run, sequence, rasterizer, args.stride, args.withheld_every, args.lpips)
+    true_mesh = true_mesh_of(sequence, run, args.true_mesh) if args.surface or args.true_mesh else None
+    report = scored(run, sequence, rasterizer, args.stride, args.withheld_every, args.lpips, true_mesh)
     sys.stdout.write(f"{report.table()}\n\nreport.json, contact_sheet.png and trajectory.png are in {run.path}\n")
     return 0

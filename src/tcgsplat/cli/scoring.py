@@ -1,16 +1,21 @@
 """A run and its data to a report and pictures."""
 
 import logging
+import math
 from pathlib import Path
 
 from tcgsplat.cli.progress import counting
 from tcgsplat.cli.recorder import Part
+from tcgsplat.cli.usage import UsageError
 from tcgsplat.datasets import Sequence
 from tcgsplat.evaluation import canvas
 from tcgsplat.evaluation.figures import contact_sheet_of, trajectory_plot_of
 from tcgsplat.evaluation.lpips import Lpips
+from tcgsplat.evaluation.metrics import Metric
 from tcgsplat.evaluation.report import Report, evaluate
+from tcgsplat.evaluation.surface import surface_of_run, true_mesh_path
 from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.storage.mesh_ply import read_mesh
 from tcgsplat.storage.run_directory import RunDirectory
 
 logger = logging.getLogger(__name__)
@@ -23,8 +28,12 @@ def scored(
     stride: int = 1,
     withheld_every: int | None = None,
     lpips: Path | None = None,
+    true_mesh: Path | None = None,
 ) -> Report:
-    """The report of a run; it and the pictures are in the run directory."""
+    """The report of a run; it and the pictures are in the run directory.
+
+    With a true mesh the map is fused to one and compared with it.
+    """
     distance = None if lpips is None else Lpips.read(lpips, rasterizer.device)
     with counting("frame") as progress:
         report = evaluate(
@@ -36,10 +45,46 @@ def scored(
             lpips=distance,
             progress=progress,
         )
+    if true_mesh is not None:
+        report = _with_surface(report, run, sequence, rasterizer, true_mesh)
     report.write(run.path / "report.json")
     canvas.write_png(run.path / "contact_sheet.png", contact_sheet_of(run, sequence, rasterizer))
     canvas.write_png(run.path / "trajectory.png", trajectory_plot_of(run, sequence))
     return report
+
+
+def true_mesh_of(sequence: Sequence | None, run: RunDirectory, given: Path | None) -> Path:
+    """The file of the true surface: the one that is given, or that lies with the data.
+
+    Raises:
+        UsageError: if there is none.
+    """
+    found = given or true_mesh_path(Path(run.sequence))
+    if found is None or sequence is None:
+        raise UsageError(f"--surface needs a true mesh and true poses, and {run.sequence} has none; give --true-mesh")
+    return found
+
+
+def _with_surface(
+    report: Report, run: RunDirectory, sequence: Sequence | None, rasterizer: Rasterizer, true_mesh: Path
+) -> Report:
+    """The report with rows of the surface."""
+    if sequence is None:
+        return report
+    with counting("view") as progress:
+        _, score = surface_of_run(
+            run, read_mesh(true_mesh), sequence.camera, sequence.ground_truth(), rasterizer, progress=progress
+        )
+    rows = {
+        name: Metric(value, unit) if math.isfinite(value) else "it cannot be measured on this surface"
+        for name, (value, unit) in score.rows().items()
+    }
+    added = Report.of(rows, {"surface": score.evaluated()})
+    return Report(
+        {**report.metrics, **added.metrics},
+        {**report.evaluated, **added.evaluated},
+        {**report.missing, **added.missing},
+    )
 
 
 def data_of(run: RunDirectory | None, given: Path | None) -> Sequence | None:

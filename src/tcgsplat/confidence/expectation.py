@@ -20,8 +20,9 @@ def reading_error(depth: Plane, *, noise_floor: float, noise_slope: float, large
     r"""The error that a depth reading may have, metres: its noise, and what it may be off beside an edge.
 
     $e_0(u) = \sigma(D(u)) + |\max_{v \in N(u)} D(v) + \min_{v \in N(u)} D(v) - 2 D(u)|$
-    with $\sigma(z) = floor + slope (z - 0.4)^2$ and N(u) the 3 x 3 readings about u. The second term is zero on a
-    plane, however slanted, and the height of the step beside a step: there a sensor gives one depth or the other.
+    with $\sigma(z) = floor + slope (z - 0.4)^2$ and N(u) the 3 x 3 readings about u. The second term is zero on
+    a plane, however slanted, and the height of the step beside a step: there a sensor gives one depth or the other. At
+    the border of the image and beside a hole, where a neighbour is missing, it is the slope over a pixel.
 
     Args:
         depth: Readings, metres; 0 where there is none.
@@ -44,23 +45,23 @@ def remembered(
 ) -> tuple[PerGaussian, PerGaussian]:
     r"""What is expected after one more frame, and on how much that rests.
 
-    $n' = \lambda n + \Delta n, \quad e' = (\lambda n e + \Delta s) / n'$
+    $n' = f n + \Delta n, \quad e' = (f n e + \Delta s) / n', \quad f = \lambda^{\min(1, \Delta n)}$
     with $\Delta n = \sum_u w(u) M(u)$ and $\Delta s = \sum_u w(u) M(u) |\hat D(u) - D(u)|$, where w is the weight
     $T \alpha$ of the Gaussian in a pixel, M tells where the map and the frame both have a depth, and $\hat D$ is the
-    depth of the map before it has seen the frame.
+    depth of the map before it has seen the frame. Who is hardly seen hardly forgets.
 
     Args:
         expected: $e$, metres.
         evidence: $n \ge 0$, pixels.
         pixels: $\Delta n \ge 0$; where it is 0 nothing changes.
         errors: $\Delta s$, metres times pixels.
-        memory: $\lambda$ in (0, 1]: what is left of the evidence after a frame that shows the Gaussian.
+        memory: $\lambda$ in (0, 1]: what is left of the evidence after a frame that shows a pixel of the Gaussian.
 
     Returns:
         $e'$ and $n'$.
     """
     seen = pixels > 0
-    kept = memory * evidence
+    kept = memory ** pixels.clamp_max(1.0) * evidence
     total = kept + pixels
     mean = (kept * expected + errors) / total.clamp_min(torch.finfo(total.dtype).tiny)
     return torch.where(seen, mean, expected), torch.where(seen, total, evidence)

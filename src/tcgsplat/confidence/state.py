@@ -268,7 +268,7 @@ class ConfidenceState:
             self.expected_error, self.evidence, pixels, errors, memory=config.error_memory
         )
         value = expectation.confidence(error, error_ref=config.error_ref, p_min=config.p_min)
-        known = torch.where(evidence > 0, value, self.value)
+        known = torch.where(pixels > 0, value, self.value)
         return replace(self, value=known, expected_error=error, evidence=evidence)
 
     @torch.no_grad()

@@ -83,8 +83,10 @@ class Mapper:
         first, frame, T_map_cam = not submap.keyframes, keyframe.balanced, keyframe.T_map_cam
         rendering = None if first else render_view(submap, frame.camera, T_map_cam, self._rasterizer)
         seeds = seed(frame, T_map_cam, rendering, submap.gaussians, self._ids, self._generator, self._config.seeding)
-        pixels = frame.camera.project(se3.transform(se3.inverse(T_map_cam), seeds.means))
-        doubt = eq.sample_at(birth_error(frame, rendering, self._confidence), pixels)
+        doubt = None
+        if self._confidence.model == "expectation":
+            pixels = frame.camera.project(se3.transform(se3.inverse(T_map_cam), seeds.means))
+            doubt = eq.sample_at(birth_error(frame, rendering, self._confidence), pixels)
         keyframes = thinned((*submap.keyframes, keyframe), self._config.max_keyframes)
         grown = replace(submap.grown(seeds, self._confidence, doubt), keyframes=keyframes)
         return Grown(grown, len(seeds), first, submap, rendering)

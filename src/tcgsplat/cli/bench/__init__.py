@@ -149,6 +149,9 @@ class SuiteArgs:
     """Rasterizer: auto, numba or reference."""
     lpips: Path | None = None
     """Weights for LPIPS, as for `tcgsplat eval`."""
+    refine: int = 5
+    """Refine the one map by so many steps a keyframe before it is scored, as `tcgsplat refine` does; 0 to score it as
+    the submaps merge. The published pictures are of a map of its own, which was trained offline by 30000 steps."""
     cluster: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="[ADDRESS]")] = None
     """Spread the runs over a Ray cluster: that at ADDRESS, or one started on this machine if it is left out or
     `local`. A worker that dies costs one run, which is tried again. Times are then those of whatever machine it was."""

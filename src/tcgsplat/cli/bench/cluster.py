@@ -1,5 +1,6 @@
 """Runs of a bench on the machines of a Ray cluster; nothing else of the package knows Ray."""
 
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -62,6 +63,7 @@ def spread(jobs: Sequence[Job], out: Path, address: tuple[str, ...]) -> Iterator
 @contextmanager
 def _connected(address: str) -> Iterator[Any]:
     """Ray, connected to a cluster."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is told to anybody unless the user wants it
     try:
         import ray
     except ImportError as error:

@@ -1,13 +1,16 @@
 """One run of a suite, from its data to its report, and what is kept of it."""
 
+import io
 import json
 import logging
 import shutil
 from collections.abc import Mapping
+from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from tcgsplat.cli import refine
 from tcgsplat.cli.bench.suites import Source
 from tcgsplat.cli.progress import counting
 from tcgsplat.cli.recorder import Part, begin, recorded, resume
@@ -15,7 +18,7 @@ from tcgsplat.cli.scoring import scored
 from tcgsplat.cli.summary import versions
 from tcgsplat.config import from_toml
 from tcgsplat.datasets.synthetic import synthesize
-from tcgsplat.errors import ArchiveError, TCGSplatError
+from tcgsplat.errors import ArchiveError, DatasetError, TCGSplatError
 from tcgsplat.evaluation.metrics import Metric, Report
 from tcgsplat.render.backends import open_rasterizer
 from tcgsplat.storage import atomic
@@ -45,6 +48,8 @@ class Job:
     backend: str = "auto"
     lpips: Path | None = None
     """Weights, as for `tcgsplat eval`."""
+    refine: int = 0
+    """Steps for each keyframe that the one map is refined by before it is scored."""
 
     @property
     def key(self) -> tuple[str, str, int]:
@@ -65,6 +70,7 @@ class Job:
             "part": asdict(self.part),
             "backend": self.backend,
             "lpips": None if self.lpips is None else str(self.lpips),
+            "refine": self.refine,
             "versions": versions(),
             "config": self.config_toml,
         }
@@ -87,6 +93,8 @@ class Outcome:
     metrics: Mapping[str, Metric] = field(default_factory=dict)
     absent: Mapping[str, str] = field(default_factory=dict)
     """Why a metric is not there, by its name."""
+    evaluated: Mapping[str, str] = field(default_factory=dict)
+    """Which frames, poses and pixels."""
     summary: Mapping[str, Any] = field(default_factory=dict)
     """Of the run: times by stage, versions, machine."""
     place: str = ""
@@ -117,7 +125,7 @@ class Outcome:
 def performed(job: Job, path: Path) -> Report:
     """Run and score a job; what it was resumed from is used where it is of the same job.
 
-    This is `tcgsplat run --resume` and `tcgsplat eval`, in one process; whoever wants to see every step of SLAM puts
+    This is `tcgsplat run --resume`, `refine` and `eval`, in one process; whoever wants to see every step of SLAM puts
     an observer here.
 
     Args:
@@ -135,6 +143,12 @@ def performed(job: Job, path: Path) -> Report:
         summary = recorded(sequence, config, rasterizer, run, job.preset)
         if summary.interrupted:
             raise KeyboardInterrupt(f"stopped; saved {summary}: {run.path}")
+    if job.refine and not (path / "map.npz").exists():
+        with redirect_stdout(io.StringIO()):  # the report tells the same
+            stopped = refine.command(refine.Args(path, steps=job.refine, backend=job.backend))
+        if stopped:
+            (path / "map.npz").unlink(missing_ok=True)  # refined by fewer steps than asked for
+            raise KeyboardInterrupt(f"stopped while the map was refined: {run.path}")
     return scored(run, sequence, rasterizer, lpips=job.lpips)
 
 
@@ -181,7 +195,7 @@ def finished(job: Job, out: Path) -> Outcome | None:
     try:
         evaluated = report.pop("evaluated")
         metrics = {name: Metric(one["value"], one["unit"]) for name, one in report.items()}
-        absent = dict(evaluated["missing"])
+        absent = dict(evaluated.pop("missing"))
         frames, lost = int(summary["frames"]), int(summary["frames_lost"])
     except (KeyError, TypeError, ValueError):
         return None
@@ -192,29 +206,33 @@ def finished(job: Job, out: Path) -> Outcome | None:
         why=f"tracking was lost in {lost} of {frames} frames" if too_lost else "",
         metrics=metrics,
         absent=absent,
+        evaluated=evaluated,
         summary=summary,
         place=job.place.as_posix(),
     )
 
 
-def made(job: Job, folder: Path | None = None) -> None:
-    """Make a synthetic sequence where it is not there, or is another one; `folder` if not in the job's own.
+def made(job: Job) -> None:
+    """Make a synthetic sequence where it is not there, or is another one.
 
     Raises:
         DatasetError: if something else is in its place.
     """
-    folder, synth = folder or job.folder, job.source.synth
+    folder, synth = job.folder, job.source.synth
     if synth is None:
         return
     told = folder.with_name(f"{folder.name}.json")
-    if folder.exists() and _told(told) == asdict(synth):
-        return
-    if folder.exists() and told.exists():  # ours, of another configuration
-        told.unlink()
+    before = _told(told)
+    if folder.exists():
+        if before == asdict(synth):
+            return
+        if not before:
+            raise DatasetError(f"{folder} was made by no bench; move it away, or choose another --out")
         shutil.rmtree(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    atomic.write_text(told, json.dumps(asdict(synth), indent=2) + "\n")  # first, as the folder comes complete
     with counting(f"{job.source.name}: frame") as progress:
         synthesize(folder, synth, progress)
-    atomic.write_text(told, json.dumps(asdict(synth), indent=2) + "\n")
 
 
 def _told(path: Path) -> dict[str, Any]:

@@ -39,6 +39,8 @@ def command(args: SuiteArgs, flags: Mapping[str, str]) -> int:
             if outcome.why:
                 sys.stderr.write(f"tcgsplat: {_named(outcome)} {outcome.state}: {outcome.why}\n")
     except KeyboardInterrupt as interrupt:
+        for outcome in filter(None, (finished(job, out) for job in jobs)):  # one may have been finished just now
+            results = results.with_outcome(outcome)
         write_page(results, out)
         kept = f"{results.count('done')} of {len(jobs)} runs are kept in {out}"
         raise KeyboardInterrupt(f"interrupted; {kept}: the same command goes on") from interrupt
@@ -70,6 +72,8 @@ def chosen(args: SuiteArgs) -> Suite:
             raise UsageError(f"--sequences: there is no {name} in {suite.title}; choose from {', '.join(known)}")
     if args.seeds < 1 or not args.presets:
         raise UsageError("--seeds counts from 1, and --presets needs at least one")
+    if args.refine < 0:
+        raise UsageError(f"--refine is {args.refine}; give steps from 0 on")
     sources = tuple(known[name] for name in args.sequences) or suite.sources
     return replace(suite, sources=sources, presets=tuple(dict.fromkeys(args.presets)), seeds=args.seeds)
 
@@ -98,7 +102,7 @@ def planned(
                     why = f"no files in {' or '.join(map(str, source.expected(data)))}"
                     missing.append(Outcome(source.name, preset, seed, "missing", why))
                 else:
-                    jobs.append(Job(source, folder, preset, seed, toml, part, backend, args.lpips))
+                    jobs.append(Job(source, folder, preset, seed, toml, part, backend, args.lpips, args.refine))
     return tuple(jobs), tuple(missing)
 
 

@@ -53,7 +53,7 @@ def rendering(outcomes: Outcomes, sequences: Sequence[str], suite: Suite) -> str
     notes = "".join(f" LPIPS: {reason}." for reason in reasons)
     caption = (
         "Means over the sequences, of views drawn at their estimated poses: from the submap that they were tracked in, "
-        f"and from the one map of all submaps, which is not refined unless `tcgsplat refine` did.{notes} "
+        f"and from the one map of all submaps ({_map(outcomes)}).{notes} "
         f"{_source(printed)}"
     )
     per_sequence = _by_sequence(outcomes, sequences, suite, "psnr_withheld", 2, None)
@@ -128,13 +128,15 @@ def paired(outcomes: Outcomes, metric: str, reference: str) -> tuple:  # type: i
 
 
 def runtime(outcomes: Outcomes, suite: Suite) -> str:
-    """Times of a frame and of its stages, memory and size of the map: means over all runs."""
+    """Times of a frame and of its stages, and size of the map: means over all runs.
+
+    No memory: `peak_rss_mb` is of the process, which has made the runs before in it too.
+    """
     columns: dict[str, Callable[[Outcome], float | None]] = {
         "frame [ms]": lambda one: one.value("ms_per_frame"),
         "tracking [ms]": lambda one: _stage(one, "track"),
         "mapping update [ms]": lambda one: _summary(one, "ms_update"),
         "closing a loop [ms]": lambda one: _summary(one, "ms_closure"),
-        "memory [MB]": lambda one: one.value("peak_rss_mb"),
         "Gaussians": lambda one: one.value("gaussians"),
         "run [s]": lambda one: _summary(one, "seconds"),
     }
@@ -166,6 +168,11 @@ def runs(outcomes: Outcomes) -> str:
         cells = (NONE if path is None else f"{path.value:.3f}", NONE if lost is None else str(lost.value))
         rows.append([one.sequence, f"`{one.preset}`", str(one.seed), state, *cells, links])
     return _markdown(("sequence", "preset", "seed", "state", "ATE [cm]", "frames lost", "files"), rows, left=2)
+
+
+def _map(outcomes: Outcomes) -> str:
+    """What it was when it was scored."""
+    return "; ".join(sorted({one.evaluated["map"] for one in outcomes if "map" in one.evaluated})) or "no run yet"
 
 
 def _by_sequence(

@@ -1,0 +1,322 @@
+"""`tcgsplat bench SUITE`: what is run, what is not run again, and what the page says of it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from analytic_room import Room, walk
+
+from tcgsplat.cli.bench import tables
+from tcgsplat.cli.bench.page import Results, page
+from tcgsplat.cli.bench.performing import Outcome
+from tcgsplat.cli.bench.suites import REPLICA, SCANNET, SYNTHETIC, TUM, Suite
+from tcgsplat.cli.main import main
+from tcgsplat.config import from_toml, settings
+from tcgsplat.datasets.synthetic.raster import View
+from tcgsplat.datasets.synthetic.writer import sequence_files
+from tcgsplat.evaluation import published
+from tcgsplat.evaluation.metrics import Metric
+from tcgsplat.geometry.camera import Camera
+
+QUICK = ["--mapper.iterations", "3", "--mapper.first-iterations", "5", "--schedule.map-every", "2", "--refine", "1"]
+DESK, XYZ = "rgbd_dataset_freiburg1_desk", "rgbd_dataset_freiburg2_xyz"
+
+
+def record_room(root: Path) -> None:
+    """Eight frames of the analytic room, as in the TUM benchmark."""
+    poses, seconds = walk(8), np.arange(8) / 30
+    root.mkdir(parents=True)
+    files = sequence_files(root, "tum", seconds, ())
+    for index, T_world_cam in enumerate(poses):
+        frame = Room().frame(T_world_cam, index, Camera(70.0, 70.0, 39.5, 29.5, 80, 60))
+        color = (255 * frame.color.clamp(0, 1)).round().byte().numpy()
+        files.write_frame(index, color, frame.depth.double().numpy(), None)
+    files.write_index(View(80, 60, 70.0, 39.5, 29.5), seconds, torch.stack(poses).numpy(), np.ones(8, dtype=bool))
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """Two of the five sequences of the TUM suite."""
+    for name in (DESK, XYZ):
+        record_room(tmp_path / "data" / name)
+    return tmp_path / "data"
+
+
+def ask(data: Path, out: Path, *more: str) -> list[str]:
+    return ["bench", "tum", "--data", str(data), "--out", str(out), *QUICK, *more]
+
+
+def results(out: Path) -> dict[tuple[str, str, int], dict[str, Any]]:
+    written = json.loads((out / "results.json").read_text())
+    return {(run["sequence"], run["preset"], run["seed"]): run for run in written["runs"]}
+
+
+def stamps(out: Path, name: str) -> dict[str, int]:
+    return {str(path.relative_to(out)): path.stat().st_mtime_ns for path in out.glob(f"runs/*/*/*/{name}")}
+
+
+def test_a_suite_runs_what_is_there_and_names_what_is_not(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "out"
+    assert main(ask(data, out, "--seeds", "1", "--seed", "5")) == 0
+    told = capsys.readouterr()
+    assert told.out.startswith("4 of 4 runs: ")
+    assert f"fr1/room is left out: no files in {data / 'rgbd_dataset_freiburg1_room'}" in told.err
+    runs = results(out)
+    done = {key for key, run in runs.items() if run["state"] == "done"}
+    assert done == {(name, preset, 5) for name in ("fr1/desk", "fr2/xyz") for preset in ("default", "base")}
+    assert {run["state"] for key, run in runs.items() if key not in done} == {"missing"}
+    for key in done:
+        run = runs[key]
+        config = settings(from_toml((out / run["config"]).read_text()))
+        assert config["seed"] == 5
+        assert config["mapper.iterations"] == 3
+        assert config["confidence.guide_mapping"] is (key[1] == "default")
+        assert run["summary"]["versions"]["torch"] == torch.__version__
+        assert 0 < run["metrics"]["ate_rmse"]["value"] < 3
+        assert run["evaluated"]["map"].startswith("refined by ")
+        assert (out / run["place"] / "report.json").is_file()
+    text = (out / "README.md").read_text()
+    mean = runs["fr1/desk", "default", 5]["metrics"]["ate_rmse"]["value"]
+    assert f"| `default` | {mean:.2f} | – | – |" in text
+    assert "| *TCGSplat (published)* | 1.83 | 3.52 | 6.74 | 1.45 | 3.31 | 3.37 |" in text
+    assert f"- fr1/room: no files in {data / 'rgbd_dataset_freiburg1_room'}" in text
+    assert "`mapper.iterations = 3`" in text
+    for figure in ("ate.svg", "psnr.svg", "difference.svg"):
+        assert f"]({figure})" in text
+        assert (out / figure).read_text().startswith("<?xml")
+
+
+def test_what_is_finished_is_not_run_again(data: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    one = ["--sequences", "fr1/desk", "--presets", "default", "--limit", "6"]
+    assert main(ask(data, out, *one, "--seeds", "1")) == 0
+    report, summary = stamps(out, "report.json"), stamps(out, "summary.json")
+    (first,) = report
+    assert main(ask(data, out, *one, "--seeds", "2")) == 0
+    assert stamps(out, "report.json")[first] == report[first]
+    assert len(stamps(out, "report.json")) == 2
+
+    (out / first).unlink()  # as if stopped between the run and its evaluation
+    assert main(ask(data, out, *one, "--seeds", "1")) == 0
+    assert stamps(out, "summary.json")[first.replace("report", "summary")] in summary.values()
+    assert len(results(out)) == 1
+
+    changed = ["--tracker.smoothing", "false"]
+    assert main(ask(data, out, *one, "--seeds", "1", *changed)) == 0
+    assert stamps(out, "summary.json")[first.replace("report", "summary")] not in summary.values()
+
+
+def test_a_run_that_fails_is_a_row_and_the_rest_goes_on(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (data / DESK / "depth.txt").unlink()
+    out = tmp_path / "out"
+    assert main(ask(data, out, "--presets", "default", "--seeds", "1", "--limit", "6")) == 0
+    runs = results(out)
+    assert runs["fr2/xyz", "default", 0]["state"] == "done"
+    failed = runs["fr1/desk", "default", 0]
+    assert failed["state"] == "failed"
+    assert failed["why"] == f"no depth.txt in {data / DESK}; give the folder that holds both rgb.txt and depth.txt"
+    assert f"fr1/desk, default, seed 0: failed: {failed['why']}" in capsys.readouterr().err
+    assert f"failed: {failed['why']}" in (out / "README.md").read_text()
+
+
+def test_nothing_there_is_an_error_that_says_where_to_get_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["bench", "scannet", "--data", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    told = capsys.readouterr().err
+    assert f"0181 is left out: no files in {tmp_path / 'scene0181_00'} or {tmp_path / 'scene0181'}" in told
+    assert f"none of the sequences of ScanNet is in {tmp_path}: extract the scenes" in told
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (["--sequences", "fr9"], "there is no fr9 in TUM RGB-D; choose from fr1/desk, "),
+        (["--seeds", "0"], "--seeds counts from 1"),
+        (["--refine", "-1"], "--refine is -1; give steps from 0 on"),
+        (["--presets", "fast"], "there is no preset fast"),
+        (["--mapper.nothing", "1"], "mapper.nothing"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], told: str
+):
+    assert main(ask(data, tmp_path / "out", *more)) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_folder_of_something_else_is_left_alone(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "thesis.tex").write_text("x")
+    assert main(ask(data, out)) == 1
+    assert "holds something else than a bench" in capsys.readouterr().err
+    (out / "results.json").write_text('{"suite": "replica"}')
+    assert main(ask(data, out)) == 1
+    assert "holds the suite replica, not tum" in capsys.readouterr().err
+    assert sorted(path.name for path in out.iterdir()) == ["results.json", "thesis.tex"]
+
+
+def test_the_synthetic_suite_makes_its_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """All of the walk in 24 frames is far too fast: those runs are lost, and are said to be."""
+    out = tmp_path / "out"
+    tiny = ["bench", "synthetic", "--out", str(out), "--frames", "24", "--width", "64", *QUICK]
+    one = ["--sequences", "moving", "--presets", "default", "--seeds", "1"]
+    assert main([*tiny, *one]) == 0
+    (run,) = results(out).values()
+    assert run["state"] == "lost"
+    assert "1 failed or lost" in capsys.readouterr().out
+    assert "| moving | `default` | 0 | lost: tracking was lost in" in (out / "README.md").read_text()
+    assert (out / "data" / "moving" / "mask").is_dir()
+    before = (out / "data" / "moving" / "rgb.txt").stat().st_mtime_ns
+    assert main([*tiny, *one]) == 0
+    assert (out / "data" / "moving" / "rgb.txt").stat().st_mtime_ns == before
+    tiny[tiny.index("24")] = "12"
+    assert main([*tiny, *one]) == 0
+    assert len(list((out / "data" / "moving" / "rgb").iterdir())) == 12
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_what_is_finished_and_the_same_command_goes_on(data: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    arguments = ask(data, out, "--presets", "default", "--seeds", "6", "--sequences", "fr1/desk")
+    process = subprocess.Popen([sys.executable, "-m", "tcgsplat.cli.main", *arguments], stderr=subprocess.PIPE)
+    until(lambda: len(stamps(out, "report.json")) >= 1)
+    process.send_signal(signal.SIGINT)
+    told = process.communicate()[1].decode()
+    assert process.returncode == 130, told
+    kept = stamps(out, "report.json")
+    assert 1 <= len(kept) < 6
+    assert f"{len(kept)} of 6 runs are kept in {out}: the same command goes on" in told
+    states = [run["state"] for run in results(out).values()]
+    assert states.count("done") == len(kept)
+    assert states.count("waiting") == 6 - len(kept)
+    assert "waiting: not run yet" in (out / "README.md").read_text()
+    assert main(arguments) == 0
+    assert {run["state"] for run in results(out).values()} == {"done"}
+    assert kept.items() <= stamps(out, "report.json").items()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed: pip install 'tcgsplat[cluster]'")
+def test_a_worker_that_is_killed_costs_one_run_which_is_tried_again(data: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    arguments = ask(data, out, "--presets", "default", "--seeds", "3", "--sequences", "fr1/desk", "--cluster")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tcgsplat.cli.main", *arguments], stderr=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    until(lambda: bool(workers(process.pid)))
+    killed = workers(process.pid)[0]
+    os.kill(killed, signal.SIGKILL)
+    told = b"".join(process.communicate(timeout=250)).decode()
+    assert process.returncode == 0, told
+    assert "3 of 3 runs: " in told
+    runs = results(out)
+    assert [run["state"] for run in runs.values()] == ["done"] * 3
+    for run in runs.values():
+        assert {"config.toml", "summary.json", "report.json"} <= {path.name for path in (out / run["place"]).iterdir()}
+    kept = stamps(out, "report.json")
+    assert main(arguments) == 0, "what the cluster has done is not done again"
+    assert stamps(out, "report.json") == kept
+
+
+@pytest.mark.skipif(find_spec("ray") is not None, reason="ray is installed")
+def test_without_ray_the_error_says_what_to_install(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(ask(data, tmp_path / "out", "--cluster")) == 1
+    assert "pip install 'tcgsplat[cluster]'" in capsys.readouterr().err
+
+
+def until(true: Any, seconds: float = 200.0) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+def workers(driver: int) -> list[int]:
+    """Processes below the driver that are at work on a run."""
+    parents, names = {}, {}
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit():
+            try:
+                names[int(folder.name)] = (folder / "cmdline").read_bytes()
+                parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            except OSError:
+                continue
+
+    def below(process: int) -> bool:
+        return process == driver or (process in parents and below(parents[process]))
+
+    return [process for process, name in names.items() if name.startswith(b"ray::_task") and below(process)]
+
+
+def outcome(preset: str, sequence: str, seed: int, cm: float | None, **more: float) -> Outcome:
+    if cm is None:
+        return Outcome(sequence, preset, seed, "failed", "no reason")
+    metrics = {"ate_rmse": Metric(cm, "cm")} | {name: Metric(value) for name, value in more.items()}
+    return Outcome(sequence, preset, seed, "done", metrics=metrics, place=f"runs/{sequence}/{preset}/{seed}")
+
+
+def rows(text: str) -> list[list[str]]:
+    """Cells of the lines of a table; all lines are equally long."""
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
+
+
+def test_means_and_spreads_by_hand():
+    some = [outcome("default", "clean", seed, cm) for seed, cm in ((0, 1.0), (1, 3.0))]
+    some += [outcome("default", "moving", 0, 5.0), outcome("default", "moving", 1, None)]
+    table = rows(tables.ate(some, ["clean", "moving"], SYNTHETIC))
+    assert table[0] == ["method", "clean", "moving", "mean"]
+    # the mean over sequences is of seed 0 alone: seed 1 lacks a sequence
+    assert table[2] == ["`default`", "2.00 ± 1.41", "5.00 (1 of 2 runs)", "3.00"]
+    assert table[3] == ["`base`", "–", "–", "–"]
+
+
+def test_differences_are_to_the_last_preset():
+    some = [outcome("default", "clean", seed, 1.0) for seed in (0, 1)]
+    some += [outcome("base", "clean", seed, 1.5) for seed in (0, 1)]
+    table = rows(tables.differences(some, SYNTHETIC))
+    assert table[2][:3] == ["`default`", "ATE RMSE [cm] ↓", "-0.500"]
+    assert table[2][-2:] == ["2", "0"]
+
+
+@pytest.mark.parametrize("suite", [SYNTHETIC, TUM, REPLICA, SCANNET], ids=lambda suite: suite.name)
+def test_a_page_of_nothing_yet_is_whole(suite: Suite):
+    sequences = [source.name for source in suite.sources]
+    waiting = [Outcome(name, preset, 0, "waiting") for name in sequences for preset in suite.presets]
+    text = page(Results(suite, {}, tuple(waiting)))
+    assert ("(published)* | " in text) and ("nan" not in text)
+    table: list[list[str]] = []
+    for block in text.split("\n\n"):
+        if table := rows(block):
+            assert len({len(line) for line in table}) == 1, block
+
+
+def test_every_source_is_in_the_published_tables():
+    for suite in (TUM, REPLICA, SCANNET):
+        table = published.ATE[suite.name]
+        assert [source.column for source in suite.sources] == list(table.columns[:-1])
+    assert [source.column for source in REPLICA.sources] == list(published.F1.columns[:-1])
+
+
+@pytest.mark.parametrize("table", [*published.ATE.values(), published.DEPTH_L1, published.F1], ids=lambda t: t.measures)
+def test_the_published_means_are_those_of_the_published_rows(table: published.Table):
+    """To the last printed digit, as the paper rounds later than its rows: a digit copied wrongly shows."""
+    digits = 1 if table is published.F1 or table is published.ATE["scannet"] else 2
+    wrong: Mapping[str, tuple[float, float]] = {
+        method: (average, float(np.mean(values)))
+        for method, (*values, average) in table.rows.items()
+        if average is not None and abs(average - np.mean(values)) > 10**-digits
+    }
+    assert not wrong
