@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Mapping
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,8 +19,9 @@ from tcgsplat.cli.scoring import scored
 from tcgsplat.cli.summary import versions
 from tcgsplat.config import from_toml
 from tcgsplat.datasets.synthetic import synthesize
-from tcgsplat.errors import ArchiveError, DatasetError, TCGSplatError
+from tcgsplat.errors import ArchiveError, DatasetError, EvaluationError, TCGSplatError
 from tcgsplat.evaluation.metrics import Metric, Report
+from tcgsplat.evaluation.surface import true_mesh_path
 from tcgsplat.render.backends import open_rasterizer
 from tcgsplat.storage import atomic
 from tcgsplat.storage.run_directory import RunDirectory
@@ -71,6 +73,7 @@ class Job:
             "backend": self.backend,
             "lpips": None if self.lpips is None else str(self.lpips),
             "refine": self.refine,
+            "surface": find_spec("open3d") is not None,
             "versions": versions(),
             "config": self.config_toml,
         }
@@ -149,7 +152,14 @@ def performed(job: Job, path: Path) -> Report:
         if stopped:
             (path / "map.npz").unlink(missing_ok=True)  # refined by fewer steps than asked for
             raise KeyboardInterrupt(f"stopped while the map was refined: {run.path}")
-    return scored(run, sequence, rasterizer, lpips=job.lpips)
+    true_mesh = true_mesh_path(job.folder) if find_spec("open3d") else None
+    try:
+        return scored(run, sequence, rasterizer, lpips=job.lpips, true_mesh=true_mesh)
+    except EvaluationError as error:
+        if true_mesh is None:
+            raise
+        logger.warning("%s: there are no figures of the surface: %s", job, error)
+        return scored(run, sequence, rasterizer, lpips=job.lpips)
 
 
 def _begun(job: Job, path: Path) -> RunDirectory:

@@ -3,6 +3,7 @@
 import math
 import statistics
 from collections.abc import Callable, Iterable, Sequence
+from typing import Final
 
 from tcgsplat.cli.bench.performing import Outcome
 from tcgsplat.cli.bench.suites import Suite
@@ -32,6 +33,7 @@ def rendering(outcomes: Outcomes, sequences: Sequence[str], suite: Suite) -> str
         "_withheld": "never mapped, own submap",
         "_map": "training, one map",
         "_map_withheld": "never mapped, one map",
+        "_free": "beside the path, one map",
     }
     figures = {"psnr": 2, "ssim": 3, "ms_ssim": 3, "lpips": 3, "depth_l1": 2}
     names = ("PSNR [dB] ↑", "SSIM ↑", "MS-SSIM ↑", "LPIPS ↓", "depth L1 [cm] ↓")
@@ -52,8 +54,8 @@ def rendering(outcomes: Outcomes, sequences: Sequence[str], suite: Suite) -> str
     )
     notes = "".join(f" LPIPS: {reason}." for reason in reasons)
     caption = (
-        "Means over the sequences, of views drawn at their estimated poses: from the submap that they were tracked in, "
-        f"and from the one map of all submaps ({_map(outcomes)}).{notes} "
+        "Means over the sequences, of views drawn at their estimated poses (those beside the path at their true ones): "
+        f"from the submap that they were tracked in, and from the one map of all submaps ({_map(outcomes)}).{notes} "
         f"{_source(printed)}"
     )
     per_sequence = _by_sequence(outcomes, sequences, suite, "psnr_withheld", 2, None)
@@ -111,7 +113,7 @@ def differences(outcomes: Outcomes, suite: Suite) -> str:
     return "\n\n".join(parts) or "There is only one preset."
 
 
-COMPARED = {
+COMPARED: Final = {
     "ate_rmse": ("ATE RMSE [cm] ↓", 3),
     "psnr_withheld": ("PSNR of views never mapped [dB] ↑", 3),
     "ms_per_frame": ("time of a frame [ms] ↓", 1),
