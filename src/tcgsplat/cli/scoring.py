@@ -8,8 +8,10 @@ from tcgsplat.cli.progress import counting
 from tcgsplat.cli.recorder import Part
 from tcgsplat.cli.usage import UsageError
 from tcgsplat.datasets import Sequence
+from tcgsplat.datasets.truth import Truth
 from tcgsplat.evaluation import canvas
 from tcgsplat.evaluation.figures import contact_sheet_of, trajectory_plot_of
+from tcgsplat.evaluation.free import free_rows
 from tcgsplat.evaluation.lpips import Lpips
 from tcgsplat.evaluation.metrics import Metric
 from tcgsplat.evaluation.report import Report, evaluate
@@ -17,6 +19,7 @@ from tcgsplat.evaluation.surface import surface_of_run, true_mesh_path
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.storage.mesh_ply import read_mesh
 from tcgsplat.storage.run_directory import RunDirectory
+from tcgsplat.storage.world_map import world_map
 
 logger = logging.getLogger(__name__)
 
@@ -45,6 +48,7 @@ def scored(
             lpips=distance,
             progress=progress,
         )
+    report = _with_free_views(report, run, sequence, rasterizer)
     if true_mesh is not None:
         report = _with_surface(report, run, sequence, rasterizer, true_mesh)
     report.write(run.path / "report.json")
@@ -65,6 +69,28 @@ def true_mesh_of(sequence: Sequence | None, run: RunDirectory, given: Path | Non
     return found
 
 
+def _with_free_views(report: Report, run: RunDirectory, sequence: Sequence | None, rasterizer: Rasterizer) -> Report:
+    """The report with rows of views from beside the path, if they lie with the data."""
+    truth = Truth.of(run.sequence) if sequence is not None else None
+    views = () if truth is None else truth.free_views()
+    if sequence is None or not views:
+        return report
+    (trajectory, atlas), poses = run.trajectory(), sequence.ground_truth()
+    world = zip(trajectory.rows, trajectory.world(atlas), strict=True)
+    pairs = [(T, poses[row.frame_index]) for row, T in world if row.frame_index in poses]
+    rows = free_rows(world_map(run, rasterizer), [T for T, _ in pairs], [T for _, T in pairs], views, rasterizer)
+    told = f"{len(views)} exact views from beside the path (free), in the one map, aligned by poses"
+    return _joined(report, Report.of(rows, {"free": told}))
+
+
+def _joined(report: Report, added: Report) -> Report:
+    return Report(
+        {**report.metrics, **added.metrics},
+        {**report.evaluated, **added.evaluated},
+        {**report.missing, **added.missing},
+    )
+
+
 def _with_surface(
     report: Report, run: RunDirectory, sequence: Sequence | None, rasterizer: Rasterizer, true_mesh: Path
 ) -> Report:
@@ -79,12 +105,7 @@ def _with_surface(
         name: Metric(value, unit) if math.isfinite(value) else "it cannot be measured on this surface"
         for name, (value, unit) in score.rows().items()
     }
-    added = Report.of(rows, {"surface": score.evaluated()})
-    return Report(
-        {**report.metrics, **added.metrics},
-        {**report.evaluated, **added.evaluated},
-        {**report.missing, **added.missing},
-    )
+    return _joined(report, Report.of(rows, {"surface": score.evaluated()}))
 
 
 def data_of(run: RunDirectory | None, given: Path | None) -> Sequence | None:
