@@ -149,7 +149,7 @@ class SuiteArgs:
     """Rasterizer: auto, numba or reference."""
     lpips: Path | None = None
     """Weights for LPIPS, as for `tcgsplat eval`."""
-    refine: int = 5
+    refine: int = 3
     """Refine the one map by so many steps a keyframe before it is scored, as `tcgsplat refine` does; 0 to score it as
     the submaps merge. The published pictures are of a map of its own, which was trained offline by 30000 steps."""
     cluster: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="[ADDRESS]")] = None

@@ -52,6 +52,10 @@ class Job:
     """Weights, as for `tcgsplat eval`."""
     refine: int = 0
     """Steps for each keyframe that the one map is refined by before it is scored."""
+    stride: int = 1
+    """Of the keyframes that are drawn, as `Suite.stride`."""
+    withheld_every: int | None = None
+    """As `Suite.withheld_every`."""
 
     @property
     def key(self) -> tuple[str, str, int]:
@@ -73,6 +77,7 @@ class Job:
             "backend": self.backend,
             "lpips": None if self.lpips is None else str(self.lpips),
             "refine": self.refine,
+            "views": [self.stride, self.withheld_every],
             "surface": find_spec("open3d") is not None,
             "versions": versions(),
             "config": self.config_toml,
@@ -154,12 +159,12 @@ def performed(job: Job, path: Path) -> Report:
             raise KeyboardInterrupt(f"stopped while the map was refined: {run.path}")
     true_mesh = true_mesh_path(job.folder) if find_spec("open3d") else None
     try:
-        return scored(run, sequence, rasterizer, lpips=job.lpips, true_mesh=true_mesh)
+        return scored(run, sequence, rasterizer, job.stride, job.withheld_every, job.lpips, true_mesh)
     except EvaluationError as error:
         if true_mesh is None:
             raise
         logger.warning("%s: there are no figures of the surface: %s", job, error)
-        return scored(run, sequence, rasterizer, lpips=job.lpips)
+        return scored(run, sequence, rasterizer, job.stride, job.withheld_every, job.lpips)
 
 
 def _begun(job: Job, path: Path) -> RunDirectory:

@@ -102,7 +102,8 @@ def planned(
                     why = f"no files in {' or '.join(map(str, source.expected(data)))}"
                     missing.append(Outcome(source.name, preset, seed, "missing", why))
                 else:
-                    jobs.append(Job(source, folder, preset, seed, toml, part, backend, args.lpips, args.refine))
+                    views = (suite.stride, suite.withheld_every)
+                    jobs.append(Job(source, folder, preset, seed, toml, part, backend, args.lpips, args.refine, *views))
     return tuple(jobs), tuple(missing)
 
 

@@ -47,6 +47,10 @@ class Suite:
     seeds: int = 2
     advice: str = ""
     """Where its files can be had."""
+    stride: int = 1
+    """Draw every so many-th keyframe, as `tcgsplat eval`."""
+    withheld_every: int | None = None
+    """Draw one in so many of the frames that were never mapped, as `tcgsplat eval`."""
 
     def made(self, frames: int, width: int) -> "Suite":
         """The synthetic one at another length and size; the height is three quarters of the width."""
@@ -71,6 +75,8 @@ SYNTHETIC = Suite(
         Source("moving", synth=SynthConfig(_FRAMES, depth_noise=True, moving_object=True)),
         Source("jumps", synth=SynthConfig(_FRAMES, exposure_jumps=True)),
     ),
+    stride=2,  # so that all of it takes half an hour on two cores
+    withheld_every=4,
 )
 
 _TUM = (
