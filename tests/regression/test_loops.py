@@ -28,7 +28,11 @@ from tcgsplat.tracking.alignment import AlignmentConfig
 from tcgsplat.tracking.tracker import TrackerConfig
 
 CONFIG = SlamConfig(
-    tracker=TrackerConfig(alignment=AlignmentConfig(iterations=(4, 3, 3), stride=2), synchronization="none"),
+    tracker=TrackerConfig(
+        alignment=AlignmentConfig(iterations=(4, 3, 3), stride=2),
+        synchronization="none",
+        smoothing=False,  # which would take most of the drift that there is to mend
+    ),
     mapper=MapperConfig(
         seeding=SeedingConfig(recipe="surface", spacing=2, opacity=0.9),
         iterations=4,

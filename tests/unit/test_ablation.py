@@ -28,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
     """Eight frames of the analytic room."""
     root, poses, seconds = tmp_path / "room", walk(8), np.arange(8) / 30
     root.mkdir()
-    files = sequence_files(root, "tum", seconds, masks=False)
+    files = sequence_files(root, "tum", seconds, extras=())
     for index, T_world_cam in enumerate(poses):
         frame = Room().frame(T_world_cam, index, Camera(70.0, 70.0, 39.5, 29.5, 80, 60))
         color = (255 * frame.color.clamp(0, 1)).round().byte().numpy()

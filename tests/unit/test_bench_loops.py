@@ -32,7 +32,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     camera = (CAMERA.width, CAMERA.height, CAMERA.fx, CAMERA.cx, CAMERA.cy)
     poses = [pose(0.03 * i, 0.01 * i, degrees=(0.0, -2.0 * i, 0.0)) for i in (0, 1, 2, 3, 4, 3, 2, 1, 0, -1)]
     root.mkdir()
-    files = sequence_files(root, "tum", seconds, masks=False)
+    files = sequence_files(root, "tum", seconds, extras=())
     for index, T_world_cam in enumerate(poses):
         frame = PatternedRoom().frame(T_world_cam, index, CAMERA)
         files.write_frame(

@@ -251,6 +251,8 @@ def kept(folder: Path, generator: torch.Generator, count: int) -> RunDirectory:
                 baseline=torch.ones(size),
                 born=torch.zeros(size, dtype=torch.int64),
                 updates=torch.zeros(size, dtype=torch.int64),
+                expected_error=torch.zeros(size),
+                evidence=torch.zeros(size),
             ),
         )
         run.keep(grown, random_checkpoint(generator, sealed=size, rows=4 * size))

@@ -48,7 +48,7 @@ def recorded(root: Path, room: PatternedRoom, poses: list[Pose]) -> Path:
     """Pictures of a room in TUM layout."""
     root.mkdir()
     camera, seconds = SQUARE_PIXELS, np.arange(len(poses)) / 30
-    files = sequence_files(root, "tum", seconds, masks=False)
+    files = sequence_files(root, "tum", seconds, extras=())
     for index, T_world_cam in enumerate(poses):
         frame = room.frame(T_world_cam, index, camera)
         color = (255 * frame.color.clamp(0, 1)).round().byte().numpy()

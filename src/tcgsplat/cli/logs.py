@@ -37,10 +37,12 @@ def on_stderr(debug: bool) -> Iterator[None]:
     """Show the package's warnings, or with `debug` all that it logs, while the block runs."""
     logger = logging.getLogger("tcgsplat")
     handler = Capped()
+    level = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.DEBUG if debug else logging.WARNING)
     try:
         yield
     finally:
         logger.removeHandler(handler)
+        logger.setLevel(level)
         handler.summarize()

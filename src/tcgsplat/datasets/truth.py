@@ -99,7 +99,7 @@ class Truth:
             DatasetError: if there is no such sequence or part, or `truth/events.json` makes no sense.
         """
         root = Path(folder).expanduser()
-        if not (root / "truth").is_dir():
+        if not (root / "truth" / "events.json").is_file():
             return None
         sequence = open_sequence(root, start=start, stride=stride, limit=limit)
         numbers = tuple(start + stride * index for index in range(len(sequence)))
