@@ -15,7 +15,8 @@ from tcgsplat.evaluation.free import free_rows
 from tcgsplat.evaluation.lpips import Lpips
 from tcgsplat.evaluation.metrics import Metric
 from tcgsplat.evaluation.report import Report, evaluate
-from tcgsplat.evaluation.surface import surface_of_run, true_mesh_path
+from tcgsplat.evaluation.surface import paired_poses, surface_of_run, true_mesh_path
+from tcgsplat.mapping.merging import Merged
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.storage.mesh_ply import read_mesh
 from tcgsplat.storage.run_directory import RunDirectory
@@ -37,6 +38,7 @@ def scored(
 
     With a true mesh the map is fused to one and compared with it.
     """
+    whole = world_map(run, rasterizer)  # merging takes seconds, and all that follows asks for it
     distance = None if lpips is None else Lpips.read(lpips, rasterizer.device)
     with counting("frame") as progress:
         report = evaluate(
@@ -46,11 +48,12 @@ def scored(
             stride=stride,
             withheld_every=withheld_every,
             lpips=distance,
+            whole=whole,
             progress=progress,
         )
-    report = _with_free_views(report, run, sequence, rasterizer)
+    report = _with_free_views(report, run, whole, sequence, rasterizer)
     if true_mesh is not None:
-        report = _with_surface(report, run, sequence, rasterizer, true_mesh)
+        report = _with_surface(report, run, whole, sequence, rasterizer, true_mesh)
     report.write(run.path / "report.json")
     canvas.write_png(run.path / "contact_sheet.png", contact_sheet_of(run, sequence, rasterizer))
     canvas.write_png(run.path / "trajectory.png", trajectory_plot_of(run, sequence))
@@ -69,16 +72,15 @@ def true_mesh_of(sequence: Sequence | None, run: RunDirectory, given: Path | Non
     return found
 
 
-def _with_free_views(report: Report, run: RunDirectory, sequence: Sequence | None, rasterizer: Rasterizer) -> Report:
+def _with_free_views(
+    report: Report, run: RunDirectory, whole: Merged, sequence: Sequence | None, rasterizer: Rasterizer
+) -> Report:
     """The report with rows of views from beside the path, if they lie with the data."""
     truth = Truth.of(run.sequence) if sequence is not None else None
     views = () if truth is None else truth.free_views()
     if sequence is None or not views:
         return report
-    (trajectory, atlas), poses = run.trajectory(), sequence.ground_truth()
-    world = zip(trajectory.rows, trajectory.world(atlas), strict=True)
-    pairs = [(T, poses[row.frame_index]) for row, T in world if row.frame_index in poses]
-    rows = free_rows(world_map(run, rasterizer), [T for T, _ in pairs], [T for _, T in pairs], views, rasterizer)
+    rows = free_rows(whole, *paired_poses(run, sequence.ground_truth()), views, rasterizer)
     told = f"{len(views)} exact views from beside the path (free), in the one map, aligned by poses"
     return _joined(report, Report.of(rows, {"free": told}))
 
@@ -92,14 +94,25 @@ def _joined(report: Report, added: Report) -> Report:
 
 
 def _with_surface(
-    report: Report, run: RunDirectory, sequence: Sequence | None, rasterizer: Rasterizer, true_mesh: Path
+    report: Report,
+    run: RunDirectory,
+    whole: Merged,
+    sequence: Sequence | None,
+    rasterizer: Rasterizer,
+    true_mesh: Path,
 ) -> Report:
     """The report with rows of the surface."""
     if sequence is None:
         return report
     with counting("view") as progress:
         _, score = surface_of_run(
-            run, read_mesh(true_mesh), sequence.camera, sequence.ground_truth(), rasterizer, progress=progress
+            run,
+            read_mesh(true_mesh),
+            sequence.camera,
+            sequence.ground_truth(),
+            rasterizer,
+            whole=whole,
+            progress=progress,
         )
     rows = {
         name: Metric(value, unit) if math.isfinite(value) else "it cannot be measured on this surface"

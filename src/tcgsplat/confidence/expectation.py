@@ -16,6 +16,11 @@ NEAREST = 0.4
 """Where a depth sensor's noise is least, metres (Nguyen et al., 3DIMPVT 2012)."""
 
 
+def noise(depth: Plane, *, noise_floor: float, noise_slope: float) -> Plane:
+    r"""Spread of a depth reading, metres: $\sigma(z) = floor + slope (z - 0.4)^2$; see `reading_error`."""
+    return noise_floor + noise_slope * (depth - NEAREST).square()
+
+
 def reading_error(depth: Plane, *, noise_floor: float, noise_slope: float, largest: float) -> Plane:
     r"""The error that a depth reading may have, metres: its noise, and what it may be off beside an edge.
 
@@ -36,8 +41,8 @@ def reading_error(depth: Plane, *, noise_floor: float, noise_slope: float, large
     read = depth > 0
     far = functional.max_pool2d(depth[None, None], 3, stride=1, padding=1)[0, 0]
     near = -functional.max_pool2d(torch.where(read, -depth, -torch.inf)[None, None], 3, stride=1, padding=1)[0, 0]
-    noise = noise_floor + noise_slope * (depth - NEAREST).square()
-    return torch.where(read, noise + (far + near - 2 * depth).abs(), largest).clamp_max(largest)
+    spread = noise(depth, noise_floor=noise_floor, noise_slope=noise_slope)
+    return torch.where(read, spread + (far + near - 2 * depth).abs(), largest).clamp_max(largest)
 
 
 def remembered(

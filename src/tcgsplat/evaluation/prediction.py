@@ -12,20 +12,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tcgsplat.confidence.expectation import reading_error
+from tcgsplat.confidence.expectation import noise, reading_error
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.evaluation.uncertainty import Ordered, Scores, Sparsification, Values, sparsification
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.render.view import Rendering, SubmapView
+from tcgsplat.render.view import Rendering, render_view
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Image, Mask, Plane, Pose
 
 OURS = "confidence"
 """The measure that is judged: 1 less the rendered confidence P of equation 17."""
-OVER_OPACITY = "confidence over opacity"
-"""1 less P over alpha: coverage left out."""
 BAD_METERS, BAD_SHARE, BAD_COLOR = 0.02, 0.05, 0.1
 """A depth is bad if it is off by more than both of the first two (metres, share), a colour by more than the last."""
 _MANY = 20.0
@@ -74,11 +72,10 @@ def claim(
         rng: For the shuffled measure.
         previous: Of an earlier frame.
     """
-    rendering = SubmapView(submap, rasterizer)(camera, T_map_cam)
+    rendering = render_view(submap, camera, T_map_cam, rasterizer)
     counted = replace(submap.confidence, value=(submap.confidence.updates.float() / _MANY).clamp_max(1.0))
-    observed = SubmapView(replace(submap, confidence=counted), rasterizer)(camera, T_map_cam).confidence
+    observed = render_view(replace(submap, confidence=counted), camera, T_map_cam, rasterizer).confidence
     depth, alpha = rendering.depth, rendering.alpha
-    noise = config.noise_floor + config.noise_slope * (depth - 0.4).square()
     edge = reading_error(depth, noise_floor=0.0, noise_slope=0.0, largest=config.error_max)
     ours = 1.0 - rendering.confidence
     shuffled = torch.from_numpy(rng.permutation(ours.numpy().ravel()).reshape(ours.shape))
@@ -86,13 +83,13 @@ def claim(
         rendering,
         {
             OURS: ours,
-            OVER_OPACITY: 1.0 - rendering.confidence / alpha.clamp_min(1e-3),
+            "confidence over opacity": 1.0 - rendering.confidence / alpha.clamp_min(1e-3),
             "constant": torch.ones_like(ours),
             "shuffled": shuffled,
             "opacity": 1.0 - alpha,
             "observations": 1.0 - observed,
             "previous residual": _carried(previous, submap, depth, camera, T_map_cam),
-            "depth noise": noise,
+            "depth noise": noise(depth, noise_floor=config.noise_floor, noise_slope=config.noise_slope),
             "depth edge": edge,
         },
         {"depth": depth, "opacity": alpha, "observations": observed, "gradient": _gradient(rendering.color)},

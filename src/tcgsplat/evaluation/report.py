@@ -58,6 +58,7 @@ def evaluate(
     stride: int = 1,
     withheld_every: int | None = None,
     lpips: Lpips | None = None,
+    whole: Merged | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Report:
     """Score a run, finished or not, by its own files and the frames and ground truth of its sequence.
@@ -89,6 +90,7 @@ def evaluate(
         withheld_every: Draw one withheld frame in so many; if not given, all that were kept back on purpose, or of
             those that only happened not to be mapped `MOST_WITHHELD` at most.
         lpips: The perceptual distance; `lpips` is missing without.
+        whole: The one map of the run, if it is at hand.
         progress: Told how many frames of how many are done.
 
     Returns:
@@ -103,7 +105,7 @@ def evaluate(
     if run.submap_count == 0 or len(trajectory) == 0:
         raise EvaluationError(f"{run.path} has no sealed submap yet; let the run go on for longer, or run again")
     truth = sequence.ground_truth() if sequence is not None else {}
-    whole = world_map(run, rasterizer)
+    whole = world_map(run, rasterizer) if whole is None else whole
     scored = sum(row.frame_index in truth for row in trajectory.rows)
     withheld = withheld_rows(run, trajectory)
     most = len(withheld) if withholding(run) else MOST_WITHHELD

@@ -30,6 +30,7 @@ from tcgsplat.evaluation import ate
 from tcgsplat.geometry import quaternion, se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.mapping.fusion import FusionConfig, fused, open3d
+from tcgsplat.mapping.merging import Merged
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.mesh import Mesh, Points
 from tcgsplat.storage.run_directory import RunDirectory
@@ -205,6 +206,7 @@ def surface_of_run(
     T_truth_cam: Mapping[int, Pose],
     rasterizer: Rasterizer,
     *,
+    whole: Merged | None = None,
     fusion: FusionConfig | None = None,
     config: SurfaceConfig | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -217,6 +219,7 @@ def surface_of_run(
         camera: Of the sequence.
         T_truth_cam: True pose by frame index (`Sequence.ground_truth`).
         rasterizer: Backend.
+        whole: The one map of the run, if it is at hand.
         fusion: How to fuse.
         config: How to score.
         progress: Told how many views of how many are fused.
@@ -229,15 +232,19 @@ def surface_of_run(
         BackendUnavailableError: if Open3D cannot be imported.
         EvaluationError: if fewer than three frames have a true pose, or as `surface_metrics`.
     """
+    estimated, true = paired_poses(run, T_truth_cam)
+    fit = aligned_by_poses(estimated, true)
+    whole = world_map(run, rasterizer) if whole is None else whole
+    mesh = _fitted(fused(whole.submap, rasterizer, fusion, progress), fit)
+    return mesh, surface_metrics(mesh, truth, Views(camera, true), config)
+
+
+def paired_poses(run: RunDirectory, T_truth_cam: Mapping[int, Pose]) -> tuple[list[Pose], list[Pose]]:
+    """Estimated `T_world_cam` of the frames of a run that have a true pose, and the true ones."""
     trajectory, atlas = run.trajectory()
-    pairs = [
-        (T_world_cam, T_truth_cam[row.frame_index])
-        for row, T_world_cam in zip(trajectory.rows, trajectory.world(atlas), strict=True)
-        if row.frame_index in T_truth_cam
-    ]
-    fit = aligned_by_poses([T for T, _ in pairs], [T for _, T in pairs])
-    mesh = _fitted(fused(world_map(run, rasterizer).submap, rasterizer, fusion, progress), fit)
-    return mesh, surface_metrics(mesh, truth, Views(camera, [T for _, T in pairs]), config)
+    posed = zip(trajectory.rows, trajectory.world(atlas), strict=True)
+    pairs = [(T, T_truth_cam[row.frame_index]) for row, T in posed if row.frame_index in T_truth_cam]
+    return [T for T, _ in pairs], [T for _, T in pairs]
 
 
 def aligned_by_poses(estimated: Sequence[Pose], truth: Sequence[Pose]) -> ate.Alignment:

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from tcgsplat import datasets
-from tcgsplat.cli.bench import Ablation
+from tcgsplat.cli.bench import Ablation, tables
 from tcgsplat.cli.bench.track import measured
 from tcgsplat.cli.progress import say
 from tcgsplat.cli.recorder import Part
@@ -228,5 +228,4 @@ def table(results: Results, seeds: Sequence[int]) -> str:
 
 def markdown(results: Results, seeds: Sequence[int]) -> str:
     """For a page."""
-    rule = ("---",) * 4 + ("---:",) * (len(_HEAD) - 4)
-    return "\n".join(f"| {' | '.join(line)} |" for line in (_HEAD, rule, *_cells(results, seeds)))
+    return tables.markdown(_HEAD, _cells(results, seeds), left=4)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from tcgsplat.cli.bench import Confidence
+from tcgsplat.cli.bench.tables import markdown
 from tcgsplat.cli.kernels import compile_kernels
 from tcgsplat.cli.progress import RunProgress, say
 from tcgsplat.cli.recorder import Part
@@ -22,13 +23,14 @@ from tcgsplat.config import SlamConfig, to_toml, with_settings
 from tcgsplat.datasets.truth import Event, Truth
 from tcgsplat.errors import EvaluationError
 from tcgsplat.evaluation import ate
-from tcgsplat.evaluation.prediction import OURS, OVER_OPACITY, Judged, Seen, claim, of_color, of_depth, seen
+from tcgsplat.evaluation.prediction import OURS, Judged, Seen, claim, of_color, of_depth, seen
 from tcgsplat.evaluation.reaction import reaction
 from tcgsplat.evaluation.uncertainty import Reliability, Scores, Sparsification, auroc, calibrated, reliability
 from tcgsplat.evaluation.uncertainty_plots import reliability_plot, sparsification_plot, write
 from tcgsplat.geometry import se3
 from tcgsplat.render.backends import open_rasterizer
 from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.render.view import render_view
 from tcgsplat.scene.frame import Frame
 from tcgsplat.slam import Reference, Slam, StepReport
 from tcgsplat.storage import atomic
@@ -87,13 +89,14 @@ class Observer:
 
     def _follow(self, after: Reference, frame: Frame, fault: Mask | None, T_map_cam: Pose) -> None:
         """What the map says of an earlier view, whose frame it has used by now."""
-        claimed = claim(after.submap, frame.camera, T_map_cam, self._rasterizer, self._config.confidence, self._rng)
-        doubt, mapped = claimed.doubt[OVER_OPACITY], claimed.rendering.depth > 0
+        rendering = render_view(after.submap, frame.camera, T_map_cam, self._rasterizer)
+        mapped = rendering.depth > 0
         if not bool(mapped.any()):
             return
-        self.found.mean[frame.index] = 1.0 - float(doubt[mapped].mean())
+        trust = rendering.confidence[mapped] / rendering.alpha[mapped]
+        self.found.mean[frame.index] = float(trust.mean())
         if fault is not None and int((fault & mapped).sum()) >= ENOUGH:
-            self.found.fault_auroc.append(auroc(doubt[mapped].numpy().astype(np.float64), fault[mapped].numpy()))
+            self.found.fault_auroc.append(auroc(-trust.numpy().astype(np.float64), fault[mapped].numpy()))
 
 
 @dataclass(frozen=True)
@@ -130,9 +133,10 @@ def command(args: Confidence, settings: Mapping[str, str]) -> int:
             arm, found = performed(folder, with_settings(config, {"confidence.model": model}), rasterizer, args.every)
             arms.append(arm)
             judged[model][arm.sequence] = found.depth
-    calibration = calibration_errors(judged[MODELS[0]])
+    reliabilities = leave_one_out(judged[MODELS[0]])
+    calibration = {name: one.normalised_ece for name, one in reliabilities.items()}
     about = f"{rasterizer.name}, preset {args.preset}, seed {config.seed}; {machine()}"
-    _draw(out, judged)
+    _draw(out, judged, reliabilities)
     page = written(arms, calibration, about)
     atomic.write_text(out / "README.md", page)
     content = {
@@ -193,7 +197,7 @@ def performed(folder: Path, config: SlamConfig, rasterizer: Rasterizer, every: i
 
 
 def _told(event: Event, found: Predictions, frames: int) -> dict[str, object]:
-    """What confidence did about an event: over the region at fault where there is one, else over the image."""
+    """What confidence did about an event: its mean over what is mapped of the picture."""
     values = np.full(frames, np.nan)
     for index, mean in found.mean.items():
         values[index] = mean
@@ -235,12 +239,8 @@ def summary(judged: Iterable[Judged]) -> dict[str, dict[str, float | None]]:
     }
 
 
-def calibration_errors(judged: Mapping[str, Sequence[Judged]]) -> dict[str, float]:
-    """By sequence: the expected calibration error over the mean error, fitted to all the other sequences."""
-    return {name: one.normalised_ece for name, one in _reliabilities(judged).items()}
-
-
-def _reliabilities(judged: Mapping[str, Sequence[Judged]]) -> dict[str, Reliability]:
+def leave_one_out(judged: Mapping[str, Sequence[Judged]]) -> dict[str, Reliability]:
+    """By sequence: expected against found errors, the expectation fitted to all the other sequences."""
     pairs = {
         name: (np.concatenate([one.doubt for one in frames]), np.concatenate([one.error for one in frames]))
         for name, frames in judged.items()
@@ -255,7 +255,9 @@ def _reliabilities(judged: Mapping[str, Sequence[Judged]]) -> dict[str, Reliabil
     return found
 
 
-def _draw(out: Path, judged: Mapping[str, Mapping[str, Sequence[Judged]]]) -> None:
+def _draw(
+    out: Path, judged: Mapping[str, Mapping[str, Sequence[Judged]]], reliabilities: Mapping[str, Reliability]
+) -> None:
     """Sparsification of the depth's errors, all sequences together, and the reliability of each sequence."""
     measures: dict[str, list[Sparsification]] = {}
     for model in MODELS:
@@ -268,7 +270,6 @@ def _draw(out: Path, judged: Mapping[str, Mapping[str, Sequence[Judged]]]) -> No
     if measures:
         title = "Depth error left after the most doubtful pixels are removed; predicted before seen"
         write(out / "sparsification.png", sparsification_plot(measures, title=title))
-    reliabilities = _reliabilities(judged[MODELS[0]])
     if reliabilities:
         title = "Depth error, expectation fitted to the other sequences"
         write(out / "reliability.png", reliability_plot(reliabilities, title=title))
@@ -282,27 +283,31 @@ def written(arms: Sequence[Arm], calibration: Mapping[str, float], about: str) -
         "came, at the pose that tracking found, and held against the true depth. AUSE is over that of random: 0 is an "
         "oracle, 1 knows nothing. Means over frames; of Spearman's correlation the median and the tenth percentile.",
         "## The two models, depth, predicted before seen\n",
-        _table(
+        markdown(
             ("sequence", "model", "AUSE", "Spearman", "p10", "partial", "AUROC bad", "AUROC fault", "ATE cm"),
             [
                 (arm.sequence, arm.model, *_cells(arm.depth.get(OURS, {})), _n(arm.fault_auroc, 2), _n(arm.ate_rmse_cm))
                 for arm in arms
             ],
+            left=2,
         ),
         "## The same of frames that were never mapped, in the finished map\n",
-        _table(
+        markdown(
             ("sequence", "model", "AUSE", "Spearman", "p10", "partial", "AUROC bad"),
             [(arm.sequence, arm.model, *_cells(arm.kept_back.get(OURS, {}))) for arm in arms],
+            left=2,
         ),
         "## Colour, predicted before seen\n",
-        _table(
+        markdown(
             ("sequence", "model", "AUSE", "Spearman", "p10", "partial", "AUROC bad"),
             [(arm.sequence, arm.model, *_cells(arm.color.get(OURS, {}))) for arm in arms],
+            left=2,
         ),
         f"## What is to be had for less: AUSE of depth, model {MODELS[0]}\n",
-        _table(
+        markdown(
             ("sequence", *(first[0].depth if first else ())),
             [(arm.sequence, *(_n(scores.get("ause"), 2) for scores in arm.depth.values())) for arm in first],
+            left=2,
         ),
         "![sparsification](sparsification.png)\n",
     ]
@@ -310,7 +315,7 @@ def written(arms: Sequence[Arm], calibration: Mapping[str, float], about: str) -
         rows = [(name, f"{100 * value:.0f} %") for name, value in calibration.items()]
         parts += [
             "## Calibration: error of the expected error, fitted to the other sequences\n",
-            _table(("sequence", "of the mean error"), rows),
+            markdown(("sequence", "of the mean error"), rows, left=2),
             "![reliability](reliability.png)\n",
         ]
     events = [
@@ -320,7 +325,7 @@ def written(arms: Sequence[Arm], calibration: Mapping[str, float], about: str) -
     ]
     if events:
         head = ("sequence", "model", "event", "frames", "before", "lowest", "drops after", "back after", "change")
-        parts += ["## What happens, and what confidence does: mean over the picture\n", _table(head, events)]
+        parts += ["## What happens, and what confidence does: mean over the picture\n", markdown(head, events, left=2)]
     return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
 
 
@@ -336,8 +341,3 @@ def _reacted(event: Mapping[str, object]) -> tuple[str, ...]:
 
 def _n(value: object, decimals: int = 3) -> str:
     return f"{value:.{decimals}f}" if isinstance(value, int | float) else "-"
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    rule = ("---",) * 2 + ("---:",) * (len(head) - 2)
-    return "\n".join(f"| {' | '.join(line)} |" for line in (head, rule, *rows)) + "\n"

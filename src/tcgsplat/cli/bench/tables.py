@@ -60,7 +60,7 @@ def rendering(outcomes: Outcomes, sequences: Sequence[str], suite: Suite) -> str
     )
     per_sequence = _by_sequence(outcomes, sequences, suite, "psnr_withheld", 2, None)
     return (
-        f"{caption}\n\n{_markdown(('method', 'views', *names), rows, left=2)}\n\n"
+        f"{caption}\n\n{markdown(('method', 'views', *names), rows, left=2)}\n\n"
         f"PSNR in dB of views that were never mapped, from their own submap:\n\n{per_sequence}"
     )
 
@@ -101,7 +101,7 @@ def differences(outcomes: Outcomes, suite: Suite) -> str:
             "test over pairs."
         )
         head = ("preset", "measure", "difference", "95 % interval", "p", "pairs", "left out")
-        parts.append(f"{caption}\n\n{_markdown(head, rows, left=2)}" if rows else f"{caption} There is no pair yet.")
+        parts.append(f"{caption}\n\n{markdown(head, rows, left=2)}" if rows else f"{caption} There is no pair yet.")
     if suite.name == "scannet":
         table = published.ABLATION
         printed = [
@@ -109,7 +109,7 @@ def differences(outcomes: Outcomes, suite: Suite) -> str:
             for method, cells in table.rows.items()
         ]
         names = ("row", "mapping", "tracking", "loop", "ATE [cm]")
-        parts.append(f"{table.measures}, row by row. {_source(table)}\n\n{_markdown(names, printed)}")
+        parts.append(f"{table.measures}, row by row. {_source(table)}\n\n{markdown(names, printed)}")
     return "\n\n".join(parts) or "There is only one preset."
 
 
@@ -156,7 +156,7 @@ def runtime(outcomes: Outcomes, suite: Suite) -> str:
         f"Published rows: mapping and tracking of a frame, on other data and another machine. "
         f"{_source(published.RUNTIME)}"
     )
-    return f"{caption}\n\n{_markdown(('method', *columns), rows)}"
+    return f"{caption}\n\n{markdown(('method', *columns), rows)}"
 
 
 def runs(outcomes: Outcomes) -> str:
@@ -169,7 +169,7 @@ def runs(outcomes: Outcomes) -> str:
         state = one.state if not one.why else f"{one.state}: {one.why}".replace("|", "/")
         cells = (NONE if path is None else f"{path.value:.3f}", NONE if lost is None else str(lost.value))
         rows.append([one.sequence, f"`{one.preset}`", str(one.seed), state, *cells, links])
-    return _markdown(("sequence", "preset", "seed", "state", "ATE [cm]", "frames lost", "files"), rows, left=2)
+    return markdown(("sequence", "preset", "seed", "state", "ATE [cm]", "frames lost", "files"), rows, left=2)
 
 
 def _map(outcomes: Outcomes) -> str:
@@ -191,7 +191,7 @@ def _by_sequence(
         average = printed.value(method, "Avg.") if printed else None
         whole = len(shown) == len(printed.columns) - 1 if printed else False
         rows.append([*_published(method), *map(_plain, (*values, average if whole else None))])
-    return _markdown(("method", *(source.name for source in shown), "mean"), rows)
+    return markdown(("method", *(source.name for source in shown), "mean"), rows)
 
 
 def _values(outcomes: Outcomes, preset: str, sequence: str, metric: str) -> list[float | None]:
@@ -252,7 +252,7 @@ def _source(printed: Table | None) -> str:
     return f"Published: {printed.source}; {printed.protocol}." if printed else ""
 
 
-def _markdown(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
     """So many columns to the left, numbers to the right."""
     rule = ("---",) * left + ("---:",) * (len(head) - left)
     return "\n".join(f"| {' | '.join(line)} |" for line in (head, rule, *rows))
