@@ -1,6 +1,8 @@
-"""What every test shares: environment, annotations checked at run time, a seeded generator, and a room to look at."""
+"""What every test shares: environment, annotations checked at run time, a seeded generator, and places to look at."""
 
 import os
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
 
 os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -14,6 +16,7 @@ shapes.check_from_now_on()
 from analytic_room import Room  # after the line above, or what it imports would go unchecked
 
 from tcgsplat.confidence.state import ConfidenceConfig
+from tcgsplat.datasets.synthetic.studio import Studio, furnished_studio
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.feedback import judged
 from tcgsplat.mapping.mapper import Mapper
@@ -48,3 +51,27 @@ def corner(rasterizer: Rasterizer) -> Submap:
     frame = Room().frame()
     mapped = mapper.optimized(mapper.grown(Keyframe(frame, se3.identity()), Submap.anchored(se3.identity(), index=0)))
     return judged(mapped, frame, ConfidenceConfig(), "planar")
+
+
+@pytest.fixture(scope="session")
+def workers() -> Iterator[Executor]:
+    with ThreadPoolExecutor(2) as executor:
+        yield executor
+
+
+@pytest.fixture(scope="session")
+def studio(workers: Executor) -> Studio:
+    """The synthetic apartment, lit for pictures of 64x48; to be recorded with `record`."""
+    return furnished_studio(64, 48, 0, moving_object=False, workers=workers)
+
+
+@pytest.fixture(scope="session")
+def peopled(workers: Executor) -> Studio:
+    """The apartment with somebody in it."""
+    return furnished_studio(64, 48, 0, moving_object=True, workers=workers)
+
+
+@pytest.fixture(scope="session")
+def twin_rooms(workers: Executor) -> Studio:
+    """Two rooms that look the same, and a hall between them."""
+    return furnished_studio(64, 48, 0, moving_object=False, workers=workers, place="twins")

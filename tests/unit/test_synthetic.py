@@ -1,6 +1,6 @@
 """The synthetic apartment: exact where it says so, the same every time, and every switch does one thing."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from tcgsplat.datasets.synthetic.patterns import noise
 from tcgsplat.datasets.synthetic.raster import add_light
 from tcgsplat.datasets.synthetic.raycast import cast, tree
 from tcgsplat.datasets.synthetic.sensor import dropped, exposure_gains
-from tcgsplat.datasets.synthetic.studio import Studio, furnished_studio
+from tcgsplat.datasets.synthetic.studio import Studio
 from tcgsplat.datasets.synthetic.synthesis import camera_poses, record
 from tcgsplat.datasets.synthetic.writer import complete_or_absent
 from tcgsplat.errors import ConfigError, DatasetError
@@ -27,27 +27,6 @@ Array = np.ndarray[Any, np.dtype[Any]]
 SMALL = SynthConfig(frames=12, width=64, height=48, free_views=4)
 STILL = np.eye(4)[None]
 Recorder = Callable[..., Path]
-
-
-@pytest.fixture(scope="module")
-def workers() -> Iterator[Executor]:
-    with ThreadPoolExecutor(2) as executor:
-        yield executor
-
-
-@pytest.fixture(scope="module")
-def studio(workers: Executor) -> Studio:
-    return furnished_studio(SMALL.width, SMALL.height, 0, moving_object=False, workers=workers)
-
-
-@pytest.fixture(scope="module")
-def peopled(workers: Executor) -> Studio:
-    return furnished_studio(SMALL.width, SMALL.height, 0, moving_object=True, workers=workers)
-
-
-@pytest.fixture(scope="module")
-def twin_rooms(workers: Executor) -> Studio:
-    return furnished_studio(SMALL.width, SMALL.height, 0, moving_object=False, workers=workers, place="twins")
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
 """The truth beside a recording: what a clean one would show, what is wrong with this one, and views from elsewhere."""
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from tcgsplat.datasets.synthetic import SynthConfig, lighting, raycast
 from tcgsplat.datasets.synthetic.free import APART, CLEARANCE, SEEN
 from tcgsplat.datasets.synthetic.places import PLACES
 from tcgsplat.datasets.synthetic.sensor import dropped, exposure_gains
-from tcgsplat.datasets.synthetic.studio import Studio, furnished_studio
+from tcgsplat.datasets.synthetic.studio import Studio
 from tcgsplat.datasets.synthetic.synthesis import camera_poses, record
 from tcgsplat.datasets.synthetic.timetable import Timetable
 from tcgsplat.datasets.truth import Event, Region, Truth, events_text
@@ -28,22 +28,6 @@ EVERYTHING: dict[str, Any] = {
     "moving_object": True, "dropped_frames": True, "still": 5,
 }  # fmt: skip
 Recorder = Callable[..., Path]
-
-
-@pytest.fixture(scope="module")
-def workers() -> Iterator[Executor]:
-    with ThreadPoolExecutor(2) as executor:
-        yield executor
-
-
-@pytest.fixture(scope="module")
-def studio(workers: Executor) -> Studio:
-    return furnished_studio(SMALL.width, SMALL.height, 0, moving_object=False, workers=workers)
-
-
-@pytest.fixture(scope="module")
-def peopled(workers: Executor) -> Studio:
-    return furnished_studio(SMALL.width, SMALL.height, 0, moving_object=True, workers=workers)
 
 
 @pytest.fixture(scope="module")
@@ -127,8 +111,10 @@ def test_bias_changes_noisy_depth_in_its_region_alone(recorded: Recorder) -> Non
 
 
 @pytest.mark.parametrize("place", ["apartment", "twins"])
-def test_the_biased_region_is_seen_right_for_long_before_it_is_seen_wrong(place: Any, workers: Executor) -> None:
-    studio = furnished_studio(64, 48, 0, moving_object=False, workers=workers, place=place)
+def test_the_biased_region_is_seen_right_for_long_before_it_is_seen_wrong(
+    place: Any, studio: Studio, twin_rooms: Studio
+) -> None:
+    studio = twin_rooms if place == "twins" else studio
     config = SynthConfig(place=place)
     shares = []
     for T in camera_poses(config, np.arange(0, 600, 5) / 30):
