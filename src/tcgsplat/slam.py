@@ -9,7 +9,7 @@ submap and where it stands. Progress and pictures are made by whoever consumes t
 
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -103,7 +103,13 @@ class Slam:
     """The whole online system; `step` it through the frames, then `finish`."""
 
     def __init__(
-        self, config: SlamConfig, rasterizer: Rasterizer, *, live: bool = False, store: SubmapStore | None = None
+        self,
+        config: SlamConfig,
+        rasterizer: Rasterizer,
+        *,
+        live: bool = False,
+        store: SubmapStore | None = None,
+        mapper: Callable[..., Mapper] = Mapper,
     ) -> None:
         """A system that has seen nothing yet.
 
@@ -114,6 +120,7 @@ class Slam:
                 camera that does not wait either; what comes out then depends on the machine's speed.
             store: Where finished submaps go, and are read back from when their place is seen again; if left out,
                 memory.
+            mapper: Makes the mapper, of the arguments of `Mapper`: for experiments with another one.
         """
         self.config = config
         self._live = live
@@ -121,7 +128,7 @@ class Slam:
         self._store = InMemory() if store is None else store
         self._ids, self._generator = IdSource(), torch.Generator().manual_seed(config.seed)
         self._tracker = Tracker(config.tracker, config.confidence, rasterizer)
-        self._mapper = Mapper(config.mapper, config.confidence, rasterizer, self._ids, self._generator)
+        self._mapper = mapper(config.mapper, config.confidence, rasterizer, self._ids, self._generator)
         self._schedule = Schedule(config.schedule)
         self._closer = LoopCloser(
             config.loop, config.tracker, config.confidence, rasterizer, self._store.load_submap, config.seed

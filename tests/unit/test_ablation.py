@@ -1,6 +1,7 @@
-"""`tcgsplat bench ablation`: the rows of Table 6, resumed, compared, and written down."""
+"""`tcgsplat bench ablation`: the rows of Table 6 and controls, resumed, compared, and written down."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +11,22 @@ import torch
 from analytic_room import Room, walk
 
 from tcgsplat.cli.bench import ablation
-from tcgsplat.cli.bench.ablation import ROWS, Results, Run
+from tcgsplat.cli.bench.ablation import Results, Run, differences
+from tcgsplat.cli.bench.arms import ARMS, OracleMapper, faulty
 from tcgsplat.cli.main import main
-from tcgsplat.config import SlamConfig, settings, with_settings
+from tcgsplat.config import SlamConfig, settings
 from tcgsplat.datasets.synthetic.raster import View
 from tcgsplat.datasets.synthetic.writer import sequence_files
+from tcgsplat.datasets.truth import Truth
 from tcgsplat.errors import ArchiveError
 from tcgsplat.geometry.camera import Camera
+from tcgsplat.mapping.seeding import IdSource
 from tcgsplat.presets import preset
+from tcgsplat.render.protocol import Rasterizer
 
 QUICK = ["--limit", "6", "--mapper.iterations", "3", "--mapper.first-iterations", "5", "--schedule.map-every", "2"]
-COMMON = {"sequence": "/data/room", "mapper.iterations": "10"}
+COMMON = {"limit": "6", "mapper.iterations": "10"}
+TABLE = ("--arms", "I", "II", "III", "IV")
 
 
 @pytest.fixture
@@ -42,37 +48,63 @@ def written(out: Path) -> dict[str, Any]:
 
 
 def runs(out: Path) -> dict[tuple[str, int], dict[str, Any]]:
-    return {(run["method"], run["seed"]): run for run in written(out)["runs"]}
+    return {(run["arm"], run["seed"]): run for run in written(out)["runs"]}
+
+
+def some_runs(*errors: tuple[str, str, int, float]) -> tuple[Run, ...]:
+    return tuple(Run(arm, name, seed, cm, 20 + cm, 600, seed, 17.0) for arm, name, seed, cm in errors)
 
 
 def results(*errors: tuple[str, int, float]) -> Results:
-    return Results(COMMON, tuple(Run(method, seed, cm, 600, seed, 17.0) for method, seed, cm in errors))
+    return Results(COMMON, some_runs(*((arm, "/data/room", seed, cm) for arm, seed, cm in errors)))
 
 
-def test_the_rows_are_those_of_the_paper():
-    guided = [tuple(row.switches.values()) for row in ROWS]
+def test_the_first_rows_are_those_of_the_paper():
+    guided = [tuple(arm.switches.values()) for arm in ARMS[:4]]
     assert guided == [(False, False, False), (True, False, False), (True, True, False), (True, True, True)]
-    assert [row.published_cm for row in ROWS] == [14.1, 12.8, 12.1, 10.4]
+    assert [arm.published_cm for arm in ARMS[:4]] == [14.1, 12.8, 12.1, 10.4]
     default = SlamConfig()
-    assert with_settings(default, ROWS[0].switches) == preset("base")
-    assert with_settings(default, ROWS[-1].switches) == default
-    assert set(ROWS[0].switches) < set(settings(default))
+    assert ARMS[0].config(default, default.seed) == preset("base")
+    assert ARMS[3].config(default, default.seed) == default
+    assert set(ARMS[0].switches) < set(settings(default))
+    assert len({str(arm.config(default, 0)) for arm in ARMS}) == len(ARMS), "two arms are the same"
+    assert [arm.name for arm in ARMS if arm.knows] == ["oracle"]
 
 
 def test_the_table_by_hand():
-    some = results(*[(row.method, seed, cm + 1) for row in ROWS for seed, cm in ((3, 0.0), (4, 1.0), (5, 2.0))])
-    lines = ablation.table(some, range(3, 6)).splitlines()
-    assert lines[1].split() == ["I", "-", "-", "-", "2.000", "1.000", "1.000", "3.000", "12", "14.1"]
-    assert lines[4].split() == ["IV", "yes", "yes", "yes", "2.000", "1.000", "1.000", "3.000", "12", "10.4"]
-    assert len({len(line) for line in lines}) == 1
-    page = ablation.markdown(some, range(3, 6)).splitlines()
-    assert page[3] == "| II | yes | - | - | 2.000 | 1.000 | 1.000 | 3.000 | 12 | 12.8 |"
-    assert {line.count("|") for line in page} == {11}
+    some = some_runs(
+        *((arm.name, "room", seed, cm + 1) for arm in ARMS[:4] for seed, cm in ((3, 0.0), (4, 1.0), (5, 2.0)))
+    )
+    page = ablation.written(some, ARMS, {"all": ("room",)}, "a room").splitlines()
+    assert "| I | - | - | - | 2.000 ± 1.000 | 2.000 | 22.00 | 12 | 14.1 |" in page
+    assert "| IV | yes | yes | yes | 2.000 ± 1.000 | 2.000 | 22.00 | 12 | 10.4 |" in page
+    assert "| all | II | mapping only | +0.0 | +0.0 … +0.0 | - | +0.00 | +0.00 … +0.00 | 3 |" in page
+    assert not any(line.startswith("| oracle") for line in page), "an arm without a run"
 
 
-def test_only_the_seeds_asked_for_count_and_one_has_no_spread():
-    some = results(*[(row.method, seed, 1.0 + seed) for row in ROWS for seed in range(3)])
-    assert ablation.table(some, range(1, 2)).splitlines()[1].split()[4:8] == ["2.000", "-", "2.000", "2.000"]
+def test_differences_are_percent_of_the_first_arm_and_pair_by_pair():
+    pairs = [("I", "a", 0, 1.0), ("I", "a", 1, 2.0), ("IV", "a", 0, 1.1), ("IV", "a", 1, 2.2), ("IV", "b", 0, 9.0)]
+    (one,) = differences(some_runs(*pairs), ("a", "b"))
+    assert (one.arm, one.pairs, one.left_out) == ("IV", 2, 1)
+    assert (one.mean, one.low, one.high) == pytest.approx((10.0, 10.0, 10.0))
+    (psnr,) = differences(some_runs(*pairs), ("a",), "psnr")
+    assert psnr.mean == pytest.approx(0.15)
+    assert differences(some_runs(*pairs[2:]), ("a", "b")) == ()
+
+
+def test_sequences_with_faults_are_looked_at_apart():
+    some = some_runs(*((arm, name, 0, cm) for name, cm in (("fine", 1.0), ("bad", 0.5)) for arm in ("I", "IV")))
+    groups = {"all": ("fine", "bad"), "nothing wrong": ("fine",), "with faults": ("bad",)}
+    page = ablation.written(some, ARMS, groups, "two").splitlines()
+    assert [line.split("|")[1].strip() for line in page if "| IV | all of it" in line] == list(groups)
+    assert "| IV | +0.0 | +0.0 |" in page
+
+
+def test_one_seed_has_no_spread():
+    some = some_runs(("I", "room", 1, 2.0))
+    assert "| I | - | - | - | 2.000 | 2.000 | 22.00 | 1 | 14.1 |" in ablation.written(
+        some, ARMS, {"all": ("room",)}, ""
+    )
 
 
 def test_finished_runs_are_read_back(tmp_path: Path):
@@ -106,36 +138,39 @@ def test_every_row_is_run_and_what_is_there_is_not_run_again(
 ):
     out = tmp_path / "out"
     ask = ["bench", "ablation", str(folder), "--out", str(out), *QUICK]
-    assert main([*ask, "--seeds", "1", "--seed", "7"]) == 0
+    assert main([*ask, "--seeds", "1", "--seed", "7", *TABLE]) == 0
     first = runs(out)
     assert list(first) == [("I", 7), ("II", 7), ("III", 7), ("IV", 7)]
     assert all(0 < run["ate_rmse_cm"] < 3 and (run["frames"], run["frames_lost"]) == (6, 0) for run in first.values())
     assert len({run["ate_rmse_cm"] for run in first.values()}) >= 3, "confidence guided nothing"
     said = capsys.readouterr().out
     assert f"{first['IV', 7]['ate_rmse_cm']:.3f}" in said
-    assert said.startswith("room, 6 frames; ")
+    assert said.startswith("# Ablation: room; ")
     assert "mapper.iterations = 3" in said
 
     known = written(out)
     known["runs"] = known["runs"][:2]  # as after an interruption
     known["runs"][0]["ate_rmse_cm"] = 77.0
     (out / "ablation.json").write_text(json.dumps(known))
-    assert main([*ask, "--seeds", "2", "--seed", "7"]) == 0
+    assert main([*ask, "--seeds", "2", "--seed", "7", *TABLE]) == 0
     again = runs(out)
-    assert sorted(again) == sorted((row.method, seed) for row in ROWS for seed in (7, 8))
+    assert sorted(again) == sorted((arm.name, seed) for arm in ARMS[:4] for seed in (7, 8))
     assert again["I", 7]["ate_rmse_cm"] == 77.0, "run again although it was there"
-    for method in ("III", "IV"):
-        assert again[method, 7]["ate_rmse_cm"] == first[method, 7]["ate_rmse_cm"], "a run repeats to the bit"
-    page = (out / "ablation.md").read_text()
+    for arm in ("III", "IV"):
+        for told in ("ate_rmse_cm", "psnr"):
+            assert again[arm, 7][told] == first[arm, 7][told], "a run repeats to the bit"
+    assert 10 < again["IV", 8]["psnr"] < 60
+    page = (out / "README.md").read_text()
     mean = (77.0 + again["I", 8]["ate_rmse_cm"]) / 2
-    assert f"| I | - | - | - | {mean:.3f} | " in page
-    assert page.startswith("# Ablation: room, 6 frames; ")
+    assert f"| I | - | - | - | {mean:.3f} ± " in page
+    assert "![difference of the path's error](difference.svg)" in page
+    assert (out / "difference.svg").read_text().startswith("<?xml")
 
     before = (out / "ablation.json").read_bytes()
     capsys.readouterr()
     assert main([*ask, "--mapper.iterations", "4"]) == 1
     assert "mapper.iterations 3, now 4; give another folder by --out" in capsys.readouterr().err
-    assert main([*ask[:5], "--limit", "5"]) == 1
+    assert main([*ask[:5], "--limit", "5", "--mapper.iterations", "3"]) == 1
     assert "limit 6, now 5; " in capsys.readouterr().err
     assert (out / "ablation.json").read_bytes() == before
 
@@ -154,9 +189,10 @@ def test_without_truth_nothing_is_run(folder: Path, tmp_path: Path, capsys: pyte
     [
         (
             ["--confidence.guide-mapping", "false"],
-            "--confidence.guide_mapping is what the rows differ in; leave it out",
+            "--confidence.guide_mapping is what the arms differ in; leave it out",
         ),
         (["--seeds", "0"], "--seeds is 0; give at least 1"),
+        (["--arms", "V"], "--arms: there is no V; choose from I, II, "),
     ],
 )
 def test_what_makes_no_sense_is_refused(
@@ -170,7 +206,7 @@ def test_what_makes_no_sense_is_refused(
 def test_an_interruption_says_what_is_kept(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    real, calls = ablation.measured, []
+    real, calls = ablation.walked, []
 
     def second_is_interrupted(*args: Any) -> Any:
         calls.append(1)
@@ -178,8 +214,58 @@ def test_an_interruption_says_what_is_kept(
             raise KeyboardInterrupt
         return real(*args)
 
-    monkeypatch.setattr(ablation, "measured", second_is_interrupted)
+    monkeypatch.setattr(ablation, "walked", second_is_interrupted)
     out = tmp_path / "out"
-    assert main(["bench", "ablation", str(folder), "--out", str(out), *QUICK]) == 130
+    assert main(["bench", "ablation", str(folder), "--out", str(out), *QUICK, *TABLE]) == 130
     assert f"interrupted; 1 of 12 runs are kept in {out / 'ablation.json'}" in capsys.readouterr().err
     assert list(runs(out)) == [("I", 0)]
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny walk with a Kinect's noise, whose truth is known."""
+    folder = tmp_path_factory.mktemp("ablation") / "noisy"
+    size = ["--frames", "240", "--width", "48", "--height", "36", "--free-views", "0", "--depth-noise"]
+    assert main(["synth", str(folder), *size]) == 0
+    return folder
+
+
+def test_the_controls_are_real_runs_and_no_two_alike(noisy: Path, tmp_path: Path):
+    controls = ["--seeds", "1", "--arms", "IV", "constant", "shuffled", "oracle"]
+    assert main(["bench", "ablation", str(noisy), "--out", str(tmp_path), *QUICK, *controls]) == 0
+    found = {run["arm"]: run["ate_rmse_cm"] for run in written(tmp_path)["runs"]}
+    assert list(found) == ["I", "IV", "constant", "shuffled", "oracle"]
+    assert len(set(found.values())) == 5
+
+
+def test_where_nobody_knows_the_truth_there_is_no_oracle(folder: Path, tmp_path: Path):
+    ask = ["bench", "ablation", str(folder), "--out", str(tmp_path / "out"), *QUICK]
+    assert main([*ask, "--seeds", "1", "--arms", "IV", "oracle"]) == 0
+    assert [run["arm"] for run in written(tmp_path / "out")["runs"]] == ["I", "IV"]
+
+
+def test_the_oracle_is_told_the_true_error(noisy: Path, rasterizer: Rasterizer):
+    truth = Truth.of(noisy)
+    assert truth is not None
+    frame, depth = truth.sequence.frame(1), truth.depth(1)
+    assert depth is not None
+    config = SlamConfig()
+    source = config.mapper, config.confidence, rasterizer, IdSource(), torch.Generator()
+    oracle = OracleMapper(*source, truth=truth, largest=0.5)
+    known = (frame.depth > 0) & (depth > 0)
+    assert known.float().mean() > 0.5
+    error = oracle.birth_error(frame, None)
+    assert torch.equal(error[known], (frame.depth - depth).abs().clamp_max(0.5)[known])
+    assert error[known].max() > 0, "noise that is none"
+    assert (error[~known] == 0.5).all()
+
+
+def test_what_is_wrong_with_a_sequence_is_known(noisy: Path, tmp_path: Path):
+    """Noise is, and a fault; what is only looked at is not."""
+    assert faulty(None) is None
+    assert faulty(Truth.of(noisy)) is True
+    exact = shutil.copytree(noisy, tmp_path / "exact")
+    shutil.rmtree(exact / "truth" / "depth")
+    for name, wrong in (("still camera", False), ("absence", False), ("moving object", True), ("depth bias", True)):
+        (exact / "truth" / "events.json").write_text(json.dumps([{"name": name, "first": 3, "last": 5}]))
+        assert faulty(Truth.of(exact)) is wrong, name

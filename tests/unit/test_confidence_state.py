@@ -78,7 +78,7 @@ def test_no_decay_is_a_valid_setting() -> None:
         ("view_floor", 1.1, "between 0 and 1"),
         ("stability_reduction", "max", '"mean" or "sum"'),
         ("step_scale_mode", "adam", '"step" or "gradient"'),
-        ("model", "base", '"expectation" or "paper"'),
+        ("model", "base", '"expectation" or "paper" or "constant" or "shuffled"'),
         ("error_ref", 0.0, "above 0 and finite"),
         ("error_max", math.inf, "above 0 and finite"),
         ("error_memory", 0.0, "above 0 and at most 1"),

@@ -167,6 +167,21 @@ class TestState:
         assert torch.equal(late.sealed(PAPER).value, expected)
         assert (expected < late.value).all()
 
+    @pytest.mark.parametrize("model", ["constant", "shuffled"])
+    def test_a_control_learns_as_ours_does_and_is_trusted_otherwise(self, model: str) -> None:
+        errors, pixels = torch.tensor([0.0, 0.1, 0.2, 0.5]), torch.tensor([2.0, 0.0, 3.0, 1.0])
+        config = replace(CONFIG, model=model)
+        ours = ConfidenceState.born_at(0, 4, CONFIG, expected_error=errors)
+        other = ConfidenceState.born_at(0, 4, config, expected_error=errors)
+        for _ in range(2):
+            values = ours.value[[2, 3, 0, 1]] if model == "shuffled" else torch.full((4,), config.initial)
+            assert torch.equal(other.value, values)
+            assert torch.equal(other.expected_error, ours.expected_error)
+            ours, other = (
+                state.experienced(pixels, 0.3 * pixels, one) for state, one in ((ours, CONFIG), (other, config))
+            )
+        assert same(other.sealed(config), other)
+
     def test_no_gradients_are_kept(self) -> None:
         state = ConfidenceState.born_at(0, 1, CONFIG, expected_error=torch.tensor([0.01]))
         pixels = torch.tensor([1.0], requires_grad=True)

@@ -13,6 +13,8 @@ from tcgsplat.confidence import expectation
 from tcgsplat.errors import ConfigError
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag
 
+MODELS = ("expectation", "paper", "constant", "shuffled")
+
 
 @dataclass(frozen=True)
 class ConfidenceConfig:
@@ -25,10 +27,11 @@ class ConfidenceConfig:
     5.0 mm after 100 steps, 1.8 and 2.4 after 20, 1.3 and 1.7 after 10. `for_updates_of` scales the four lengths.
     """
 
-    model: Literal["expectation", "paper"] = "expectation"
+    model: Literal["expectation", "paper", "constant", "shuffled"] = "expectation"
     """Where confidence comes from [ours]: `expectation`, the depth error that is to be expected of a Gaussian, from its
     reading and from what later frames showed before they were used (`confidence/expectation.py`); `paper`, equations 4
-    to 16."""
+    to 16. Two more are controls for experiments: `constant`, always `initial`; `shuffled`, as `expectation`, but each
+    Gaussian has that of another one, half of the map away in the order of birth: as much doubt, in the wrong places."""
     error_ref: float = 0.1
     """Expected error at which half of the confidence above the floor is gone, metres [ours]: well above what a sensor's
     noise explains (2.6 cm at 4 m), which tracking allows for by itself, and well below a wrong surface."""
@@ -114,7 +117,7 @@ class ConfidenceConfig:
         self._require("p_min", 0 < self.p_min < 1, "above 0 and below 1")
         self._require("initial", self.p_min <= self.initial <= 1, f"between p_min ({self.p_min:g}) and 1")
         self._require("decay_time", self.decay_time > 0, "above 0 mapping updates (inf for no decay)")
-        self._require("model", self.model in ("expectation", "paper"), '"expectation" or "paper"')
+        self._require("model", self.model in MODELS, " or ".join(f'"{name}"' for name in MODELS))
         for name in ("residual_ref", "distance_ref", "stability_scale", "maturity_time", "error_ref", "error_max"):
             self._require(name, 0 < getattr(self, name) < math.inf, "above 0 and finite")
         for name in (
@@ -220,9 +223,9 @@ class ConfidenceState:
         """
         value, evidence = torch.full((n,), config.initial, device=device), torch.zeros(n, device=device)
         error = torch.zeros(n, device=device)
-        if expected_error is not None and config.model == "expectation":
+        if expected_error is not None and config.model != "paper":
             error, evidence = expected_error.to(error), torch.full_like(evidence, config.error_prior)
-            value = expectation.confidence(error, error_ref=config.error_ref, p_min=config.p_min)
+            value = _trusted(error, config)
         return ConfidenceState(
             value=value,
             baseline=torch.zeros(n, device=device),
@@ -267,9 +270,9 @@ class ConfidenceState:
         error, evidence = expectation.remembered(
             self.expected_error, self.evidence, pixels, errors, memory=config.error_memory
         )
-        value = expectation.confidence(error, error_ref=config.error_ref, p_min=config.p_min)
-        known = torch.where(pixels > 0, value, self.value)
-        return replace(self, value=known, expected_error=error, evidence=evidence)
+        changed = pixels > 0 if config.model == "expectation" else evidence > 0
+        value = torch.where(changed, _trusted(error, config), self.value)
+        return replace(self, value=value, expected_error=error, evidence=evidence)
 
     @torch.no_grad()
     def observed(self, observation: Observation, config: ConfidenceConfig) -> "ConfidenceState":
@@ -313,8 +316,16 @@ class ConfidenceState:
 
         An expected error does not depend on age: with that model nothing changes.
         """
-        if config.model == "expectation":
+        if config.model != "paper":
             return self
         return replace(
             self, value=eq.calibrate_age(self.value, self.born, decay_time=config.decay_time, p_min=config.p_min)
         )
+
+
+def _trusted(expected_error: PerGaussian, config: ConfidenceConfig) -> PerGaussian:
+    """Confidence of Gaussians of which such errors are expected; not for the paper's model."""
+    if config.model == "constant":
+        return torch.full_like(expected_error, config.initial)
+    value = expectation.confidence(expected_error, error_ref=config.error_ref, p_min=config.p_min)
+    return value.roll(len(value) // 2) if config.model == "shuffled" else value

@@ -106,6 +106,11 @@ class Truth:
         counted = (_counted(event, numbers) for event in _read_events(root / "truth" / "events.json"))
         return Truth(root, sequence, numbers, tuple(event for event in counted if event))
 
+    @property
+    def exact(self) -> bool:
+        """Whether the recording's own depth is the true one in every frame."""
+        return not depth_file(self.root, 0).parent.is_dir()
+
     def depth(self, index: int) -> Plane | None:
         """Depth, metres, of all that stands still, as nobody were in the way: what a right map shows.
 
@@ -116,10 +121,9 @@ class Truth:
         """
         if not 0 <= index < len(self.numbers):
             return None
-        path = depth_file(self.root, self.numbers[index])
-        if path.parent.is_dir():
-            return torch.from_numpy(read_depth(path, DEPTH_SCALE))
-        return self.sequence.frame(index).depth
+        if self.exact:
+            return self.sequence.frame(index).depth
+        return torch.from_numpy(read_depth(depth_file(self.root, self.numbers[index]), DEPTH_SCALE))
 
     def fault(self, index: int) -> Mask | None:
         """Where an injected fault made the recording wrong; None where no part of an image is known to be wrong.

@@ -1,5 +1,6 @@
 """Mapping: grow the submap where a frame shows something new, then optimise it over its keyframes (Eqs. 20 to 24)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -84,9 +85,9 @@ class Mapper:
         rendering = None if first else render_view(submap, frame.camera, T_map_cam, self._rasterizer)
         seeds = seed(frame, T_map_cam, rendering, submap.gaussians, self._ids, self._generator, self._config.seeding)
         doubt = None
-        if self._confidence.model == "expectation":
+        if self._confidence.model != "paper":
             pixels = frame.camera.project(se3.transform(se3.inverse(T_map_cam), seeds.means))
-            doubt = eq.sample_at(birth_error(frame, rendering, self._confidence), pixels)
+            doubt = eq.sample_at(self.birth_error(frame, rendering), pixels)
         keyframes = thinned((*submap.keyframes, keyframe), self._config.max_keyframes)
         grown = replace(submap.grown(seeds, self._confidence, doubt), keyframes=keyframes)
         return Grown(grown, len(seeds), first, submap, rendering)
@@ -94,11 +95,20 @@ class Mapper:
     def optimized(self, grown: Grown) -> Mapped:
         """The grown submap, optimised over its keyframes."""
         iterations = self._config.first_iterations if grown.first else self._config.iterations
-        optimization = self._optimized(experienced(grown, self._confidence, self._rasterizer), iterations)
+        judged = experienced(grown, self._confidence, self._rasterizer, self.disagreement)
+        optimization = self._optimized(judged, iterations)
         submap = optimization.submap()
         newest = submap.keyframes[-1]
         rendering = render_view(submap, newest.frame.camera, newest.T_map_cam, self._rasterizer)
         return Mapped(grown.submap.gaussians, submap, optimization.self_distance(), rendering, optimization.loss)
+
+    def birth_error(self, frame: Frame, rendering: Rendering | None) -> Plane:
+        """See the function of that name. Who wants to know what a better judge were worth puts another one here."""
+        return birth_error(frame, rendering, self._confidence)
+
+    def disagreement(self, frame: Frame, rendering: Rendering) -> Plane:
+        """See the function of that name; as `birth_error`."""
+        return disagreement(frame, rendering)
 
     def _optimized(self, submap: Submap, iterations: int) -> Optimization:
         """Adam over drawn keyframes; faint Gaussians are dropped halfway and at the end."""
@@ -137,21 +147,35 @@ def birth_error(frame: Frame, rendering: Rendering | None, config: ConfidenceCon
     return torch.maximum(own, behind).clamp_max(largest)
 
 
+def disagreement(frame: Frame, rendering: Rendering) -> Plane:
+    """How far the map is from each reading, metres; NaN where there is nothing to compare."""
+    compared = frame.valid & (frame.depth > 0) & (rendering.depth > 0)
+    return torch.where(compared, (rendering.depth - frame.depth).abs(), torch.nan)
+
+
 @torch.no_grad()
-def experienced(grown: Grown, config: ConfidenceConfig, rasterizer: Rasterizer) -> Submap:
+def experienced(
+    grown: Grown,
+    config: ConfidenceConfig,
+    rasterizer: Rasterizer,
+    error: Callable[[Frame, Rendering], Plane] = disagreement,
+) -> Submap:
     """The grown submap, having been told how far off its older Gaussians were where the frame shows them.
 
     The frame has not been used by then: what is found here is what tracking would have found, had it known the truth.
+
+    Args:
+        grown: Not yet optimised.
+        config: The model of confidence.
+        rasterizer: Backend.
+        error: Of the map in the frame's view, metres; NaN where it is not known.
     """
     if grown.rendering is None or config.model == "paper":
         return grown.submap
-    frame, depth = grown.frame, grown.rendering.depth
-    compared = frame.valid & (frame.depth > 0) & (depth > 0)
-    error = torch.where(compared, (depth - frame.depth).abs().clamp_max(config.error_max), 0.0)
-    images = torch.stack((compared.to(error), error), dim=-1)
-    pixels, errors = blended(
-        grown.before, images, frame.camera, grown.submap.keyframes[-1].T_map_cam, rasterizer
-    ).unbind(-1)
+    errors = error(grown.frame, grown.rendering).clamp_max(config.error_max)
+    images = torch.stack((errors.isfinite().to(errors), errors.nan_to_num(0.0)), dim=-1)
+    T_map_cam = grown.submap.keyframes[-1].T_map_cam
+    pixels, total = blended(grown.before, images, grown.frame.camera, T_map_cam, rasterizer).unbind(-1)
     born = torch.zeros(len(grown.submap) - len(grown.before), device=pixels.device)
-    state = grown.submap.confidence.experienced(torch.cat((pixels, born)), torch.cat((errors, born)), config)
+    state = grown.submap.confidence.experienced(torch.cat((pixels, born)), torch.cat((total, born)), config)
     return replace(grown.submap, confidence=state)

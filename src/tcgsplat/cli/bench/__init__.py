@@ -56,20 +56,24 @@ class Track:
 
 @dataclass(frozen=True)
 class Ablation:
-    """Run the four rows of the paper's Table 6 on a sequence: confidence guides nothing (I), mapping (II), tracking too
-    (III), the choice of views for loop closure too (IV).
+    """See what it is worth that confidence guides the system: the four rows of the paper's Table 6 (nothing; mapping;
+    tracking too; loop closure too), tracking alone, loop closure alone, and three controls that guide by something
+    else: the same for all Gaussians, that of others in wrong places, and one made of the true depth.
 
-    Each row is a real run for each seed, which draws keyframes and where Gaussians begin. The table has the error of
-    the path, its mean and spread over the seeds, and the published row. Finished runs are kept in OUT/ablation.json:
-    the same command, or one with more seeds, goes on from there. Every setting is a flag, as for `tcgsplat run`.
+    Each is a real run for each sequence and seed; the seed draws keyframes and where Gaussians begin. The tables have
+    the error of the path, and the difference to the first row with an interval. Finished runs are kept in
+    OUT/ablation.json: the same command, or one with more seeds or sequences, goes on from there. Every setting is a
+    flag, as for `tcgsplat run`.
     """
 
-    folder: tyro.conf.Positional[Path]
-    """The sequence; it must have ground truth."""
+    folders: tyro.conf.Positional[tuple[Path, ...]]
+    """The sequences; they must have ground truth, and for the oracle a folder `truth`, as `tcgsplat synth` makes it."""
     out: Path | None = None
-    """Folder for ablation.json and ablation.md; runs/ablation-NAME if left out, with the name of the sequence."""
+    """Folder for README.md, ablation.json and the figure; runs/ablation-NAMES if left out, with those of sequences."""
+    arms: tuple[str, ...] = ()
+    """Only these, and I: I, II, III, IV, tracking, loop, constant, shuffled, oracle."""
     seeds: int = 3
-    """Runs of each row."""
+    """Runs of each arm on each sequence."""
     seed: int | None = None
     """The first seed, the others follow it; that of the preset if left out."""
     preset: str = "default"

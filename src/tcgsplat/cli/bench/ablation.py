@@ -1,66 +1,48 @@
-"""`tcgsplat bench ablation`: what it is worth that confidence guides mapping, tracking and loop closure (Table 6)."""
+"""`tcgsplat bench ablation`: what it is worth that confidence guides the system, beside controls that know nothing."""
 
 import json
+import math
 import statistics
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from tcgsplat import datasets
 from tcgsplat.cli.bench import Ablation, tables
-from tcgsplat.cli.bench.track import measured
+from tcgsplat.cli.bench.arms import ARMS, Arm, faulty, walked
+from tcgsplat.cli.kernels import compile_kernels
 from tcgsplat.cli.progress import say
 from tcgsplat.cli.recorder import Part
 from tcgsplat.cli.settings import resolved
 from tcgsplat.cli.summary import machine, versions
 from tcgsplat.cli.usage import UsageError
-from tcgsplat.config import SlamConfig, settings, value_text, with_settings
+from tcgsplat.config import SlamConfig, settings, value_text
+from tcgsplat.datasets.truth import Truth
 from tcgsplat.errors import ArchiveError, EvaluationError
+from tcgsplat.evaluation.paired import PairedDifference, paired_differences
+from tcgsplat.evaluation.uncertainty_plots import forest_plot
+from tcgsplat.evaluation.uncertainty_plots import write as write_figure
 from tcgsplat.render.backends import open_rasterizer
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.storage import atomic
 from tcgsplat.tensors import Pose
 
-
-@dataclass(frozen=True)
-class Row:
-    """A row of Table 6."""
-
-    method: str
-    mapping: bool
-    tracking: bool
-    loop: bool
-    published_cm: float
-    """ATE RMSE on ScanNet scene 0181 (base system in row I), published without a spread."""
-
-    @property
-    def switches(self) -> dict[str, bool]:
-        """The settings that the rows differ in."""
-        return {
-            "confidence.guide_mapping": self.mapping,
-            "confidence.guide_tracking": self.tracking,
-            "confidence.rerank_views": self.loop,
-        }
-
-
-ROWS = (
-    Row("I", False, False, False, 14.1),
-    Row("II", True, False, False, 12.8),
-    Row("III", True, True, False, 12.1),
-    Row("IV", True, True, True, 10.4),
-)
+PER_SEQUENCE = 2
+"""Seeds from which on a difference on one sequence has an interval."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One way through the sequence."""
+    """An arm's way through a sequence."""
 
-    method: str
-    """Of the row."""
+    arm: str
+    sequence: str
+    """Its folder."""
     seed: int
     ate_rmse_cm: float
-    """After rigid alignment, over all frames whose true pose is known, lost ones included."""
+    psnr: float | None
+    """dB, of views that were never mapped."""
     frames: int
     frames_lost: int
     seconds: float
@@ -71,12 +53,17 @@ class Results:
     """The runs that are finished, and what they have in common."""
 
     common: Mapping[str, str]
-    """Data, backend, versions and settings, but for the seed and the switches of the rows: by name, as text."""
+    """Part of the sequences, backend, versions and settings, but for what arms differ in: by name, as text."""
     runs: tuple[Run, ...] = ()
 
-    def of(self, row: Row, seeds: Sequence[int]) -> list[Run]:
-        """Those of a row with some seeds."""
-        return [run for run in self.runs if run.method == row.method and run.seed in seeds]
+    def find(self, arm: Arm, sequence: str, seed: int) -> Run | None:
+        """One of them."""
+        return next((run for run in self.runs if (run.arm, run.sequence, run.seed) == (arm.name, sequence, seed)), None)
+
+    def of(self, arms: Sequence[Arm], sequences: Sequence[str], seeds: Sequence[int]) -> tuple[Run, ...]:
+        """Those that were asked for, in order."""
+        found = (self.find(arm, name, seed) for name in sequences for seed in seeds for arm in arms)
+        return tuple(run for run in found if run is not None)
 
     def with_run(self, run: Run) -> "Results":
         """One more."""
@@ -92,7 +79,7 @@ class Results:
         """Those of a file, to go on from; none if there is no file.
 
         Raises:
-            ArchiveError: if it cannot be read, or its runs are of other data or settings.
+            ArchiveError: if it cannot be read, or its runs are of other settings.
         """
         if not path.exists():
             return Results(common)
@@ -113,61 +100,102 @@ class Results:
         return Results(common, runs)
 
 
+@dataclass(frozen=True)
+class Material:
+    """A sequence to run the arms on."""
+
+    sequence: datasets.Sequence
+    folder: str
+    poses: Mapping[int, Pose]
+    """The true ones, by frame index."""
+    truth: Truth | None
+    """What else is known of it."""
+
+
 def command(args: Ablation, flags: Mapping[str, str]) -> int:
-    """Do the runs that are missing, print the table, and write it down."""
-    config = _config(args, flags)
+    """Do the runs that are missing, print the tables, and write them down."""
+    config, arms = _config(args, flags), _arms(args)
     part = Part(args.start, args.stride, args.limit)
-    sequence = part.open(args.folder)
-    truth = sequence.ground_truth()
-    if len(truth) < 3:
-        raise EvaluationError(
-            f"{args.folder} has true poses for {len(truth)} of {len(sequence)} frames: the error of a path needs at "
-            "least 3; choose a sequence with ground truth"
-        )
+    materials = [_opened(folder, part) for folder in args.folders]
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
-    out = args.out or Path("runs") / f"ablation-{sequence.name}"
+    out = args.out or Path("runs") / f"ablation-{'-'.join(one.sequence.name for one in materials)}"
     seeds = range(config.seed, config.seed + args.seeds)
-    results = Results.begun(out / "ablation.json", _common(args.folder, part, rasterizer, config))
+    results = Results.begun(out / "ablation.json", _common(part, rasterizer, config))
     out.mkdir(parents=True, exist_ok=True)
-    results = completed(results, sequence, truth, config, seeds, rasterizer, out)
+    results = completed(results, materials, arms, config, seeds, rasterizer, out)
+    names = {one.folder: one.sequence.name for one in materials}
+    runs = [replace(run, sequence=names[run.sequence]) for run in results.of(arms, tuple(names), seeds)]
+    groups = _groups(materials)
     changed = "".join(f", {path} = {value}" for path, value in flags.items())
     about = (
-        f"{sequence.name}, {results.runs[0].frames} frames; {rasterizer.name}, preset {args.preset}{changed}, seeds "
+        f"{', '.join(names.values())}; {rasterizer.name}, preset {args.preset}{changed}, seeds "
         f"{', '.join(map(str, seeds))}; {machine()}"
     )
-    atomic.write_text(out / "ablation.md", f"# Ablation: {about}\n\n{markdown(results, seeds)}\n\n{NOTE}\n")
-    sys.stdout.write(f"{about}\n{table(results, seeds)}\n{NOTE}\n{out / 'ablation.md'}, {out / 'ablation.json'}\n")
+    figure = difference_plot(runs, tuple(names.values()))
+    if figure is not None:
+        write_figure(out / "difference.svg", figure)
+    page = written(runs, arms, groups, about, drawn=figure is not None)
+    atomic.write_text(out / "README.md", page)
+    sys.stdout.write(f"{page}\n{out / 'README.md'}, {out / 'ablation.json'}\n")
     return 0
 
 
-def _config(args: Ablation, flags: Mapping[str, str]) -> SlamConfig:
-    """The settings that all rows share.
+def _opened(folder: Path, part: Part) -> Material:
+    """A sequence with what is known of it.
 
     Raises:
-        UsageError: if there is to be no run, or a flag sets what the rows differ in.
+        EvaluationError: if there are fewer than three true poses.
+    """
+    sequence = part.open(folder)
+    poses = sequence.ground_truth()
+    if len(poses) < 3:
+        raise EvaluationError(
+            f"{folder} has true poses for {len(poses)} of {len(sequence)} frames: the error of a path needs at "
+            "least 3; choose a sequence with ground truth"
+        )
+    truth = Truth.of(folder, start=part.start, stride=part.stride, limit=part.limit)
+    return Material(sequence, str(folder.expanduser().resolve()), poses, truth)
+
+
+def _arms(args: Ablation) -> tuple[Arm, ...]:
+    """Those that were asked for, and the first one, which all others are compared with.
+
+    Raises:
+        UsageError: if there is none of such a name.
+    """
+    known = {arm.name: arm for arm in ARMS}
+    for name in args.arms:
+        if name not in known:
+            raise UsageError(f"--arms: there is no {name}; choose from {', '.join(known)}")
+    return tuple(arm for arm in ARMS if arm.name in args.arms or arm is ARMS[0]) if args.arms else ARMS
+
+
+def _config(args: Ablation, flags: Mapping[str, str]) -> SlamConfig:
+    """The settings that all arms share.
+
+    Raises:
+        UsageError: if there is to be no run, or a flag sets what the arms differ in.
     """
     if args.seeds < 1:
         raise UsageError(f"--seeds is {args.seeds}; give at least 1")
-    for path in ROWS[0].switches:
+    for path in ARMS[0].switches:
         if path in flags:
-            raise UsageError(f"--{path} is what the rows differ in; leave it out")
+            raise UsageError(f"--{path} is what the arms differ in; leave it out")
     return resolved(args.preset, args.config, flags, args.seed)
 
 
-def _common(folder: Path, part: Part, rasterizer: Rasterizer, config: SlamConfig) -> dict[str, str]:
+def _common(part: Part, rasterizer: Rasterizer, config: SlamConfig) -> dict[str, str]:
     """See `Results.common`."""
-    about = {"sequence": str(folder.expanduser().resolve())} | {
-        name: str(value) for name, value in asdict(part).items()
-    }
-    own = {"seed", *ROWS[0].switches}
+    about = {name: str(value) for name, value in asdict(part).items()}
+    own = {"seed", *ARMS[0].switches}
     shared = {path: value_text(value) for path, value in settings(config).items() if path not in own}
     return {**about, "backend": rasterizer.name, **versions(), **shared}
 
 
 def completed(
     results: Results,
-    sequence: datasets.Sequence,
-    truth: Mapping[int, Pose],
+    materials: Sequence[Material],
+    arms: Sequence[Arm],
     config: SlamConfig,
     seeds: Sequence[int],
     rasterizer: Rasterizer,
@@ -175,57 +203,158 @@ def completed(
 ) -> Results:
     """The results with the runs that were missing; each is on disk as soon as it is done.
 
+    An arm that knows the truth is left out where nobody does.
+
     Raises:
         EvaluationError: if fewer than three frames that could be read have a true pose.
         KeyboardInterrupt: at Ctrl-C, saying what is kept.
     """
-    wanted = [(row, seed) for seed in seeds for row in ROWS]  # seed by seed: a whole table as soon as possible
-    for number, (row, seed) in enumerate(wanted, start=1):
-        if any(run.seed == seed for run in results.of(row, seeds)):
+    compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
+    wanted = [
+        (one, arm, seed)  # seed by seed: whole tables as soon as possible
+        for seed in seeds
+        for one in materials
+        for arm in arms
+        if one.truth is not None or not arm.knows
+    ]
+    for number, (one, arm, seed) in enumerate(wanted, start=1):
+        if results.find(arm, one.folder, seed):
             continue
-        say(f"run {number} of {len(wanted)}: row {row.method}, seed {seed}")
+        say(f"run {number} of {len(wanted)}: {one.sequence.name}, arm {arm.name}, seed {seed}")
+        truth = one.truth if arm.knows else None
         try:
-            timed = measured(sequence, with_settings(config, {**row.switches, "seed": seed}), rasterizer)
+            found = walked(one.sequence, one.poses, arm.config(config, seed), rasterizer, truth)
         except KeyboardInterrupt as interrupt:
             kept = f"{number - 1} of {len(wanted)} runs are kept in {out / 'ablation.json'}"
             raise KeyboardInterrupt(f"interrupted; {kept}: the same command goes on") from interrupt
-        error = timed.ate_cm(truth)
-        if error is None:
-            raise EvaluationError(f"fewer than 3 frames of {sequence.name} that could be read have a true pose")
-        seconds = sum(row["frame"] for row in timed.seconds) + timed.finish
-        results = results.with_run(Run(row.method, seed, error, len(timed.T_world_cam), timed.lost, seconds))
+        results = results.with_run(Run(arm.name, one.folder, seed, **asdict(found)))
         results.write(out / "ablation.json")
     return results
 
 
+def _groups(materials: Sequence[Material]) -> dict[str, tuple[str, ...]]:
+    """Names of sequences that are looked at together."""
+    kinds = {one.sequence.name: faulty(one.truth) for one in materials}
+    groups = {
+        "nothing wrong": tuple(name for name, kind in kinds.items() if kind is False),
+        "with faults": tuple(name for name, kind in kinds.items() if kind),
+    }
+    return {"all": tuple(kinds), **groups} if all(groups.values()) else {"all": tuple(kinds)}
+
+
+def differences(
+    runs: Iterable[Run], sequences: Sequence[str], measure: str = "ate_rmse_cm"
+) -> tuple[PairedDifference, ...]:
+    """Every arm beside the first on the same sequences with the same seeds: ATE in percent of it, PSNR in dB."""
+    values = {
+        (run.arm, run.sequence, run.seed): value
+        for run in runs
+        if run.sequence in sequences and (value := getattr(run, measure)) is not None
+    }
+    if not any(arm == ARMS[0].name for arm, _, _ in values):
+        return ()
+    if measure == "psnr":
+        return paired_differences(values, ARMS[0].name)
+    logarithms = {key: math.log(value) for key, value in values.items()}
+    return tuple(_percent(one) for one in paired_differences(logarithms, ARMS[0].name))
+
+
+def _percent(one: PairedDifference) -> PairedDifference:
+    """Of logarithms of ratios: how many percent more that is."""
+    mean, low, high = (100 * math.expm1(value) for value in (one.mean, one.low, one.high))
+    by_sequence = {name: 100 * math.expm1(value) for name, value in one.by_sequence.items()}
+    return replace(one, mean=mean, low=low, high=high, by_sequence=by_sequence)
+
+
+def difference_plot(runs: Sequence[Run], sequences: Sequence[str]):  # type: ignore[no-untyped-def]
+    """Of the path's error, all sequences together; None without a pair."""
+    found = differences(runs, sequences)
+    told = {arm.name: f"{arm.name}: {arm.told}" for arm in ARMS}
+    named = [replace(one, arm=told[one.arm], reference=told[one.reference]) for one in found]
+    return forest_plot(named, measure="ATE RMSE", unit="%") if named else None
+
+
 NOTE = (
-    "ATE RMSE in cm after rigid alignment: mean and standard deviation (n - 1) over the seeds, least and greatest. "
-    "Lost: frames, in all runs of the row. Paper: Table 6, ScanNet scene 0181, row I its base system, no spread given."
+    "ATE RMSE in cm after rigid alignment: mean ± standard deviation (n - 1) over the seeds. Lost: frames, in all runs "
+    "of the row. PSNR: views that were never mapped, drawn from the submap that they were tracked in. Paper: Table 6, "
+    "ScanNet scene 0181, row I its base system, no spread given. `constant`, `shuffled` and `oracle` guide all three "
+    "places by something else than the map's own confidence: the same for all, that of Gaussians elsewhere, and one "
+    "made of the true depth, which no run has."
 )
-_HEAD = ("method", "mapping", "tracking", "loop", "ATE RMSE", "std", "min", "max", "lost", "paper")
+PAIRED = (
+    "Each arm beside arm I on the same sequences with the same seeds. ATE: percent of that of I (mean of logarithms), "
+    "less is better; PSNR: dB, more is better. Intervals are 95 % of a bootstrap over sequences and seeds, too narrow "
+    "where sequences are few; p of the signed-rank test over pairs."
+)
 
 
-def _cells(results: Results, seeds: Sequence[int]) -> list[tuple[str, ...]]:
-    """The table's rows without its head."""
+def written(
+    runs: Sequence[Run], arms: Sequence[Arm], groups: Mapping[str, Sequence[str]], about: str, *, drawn: bool = False
+) -> str:
+    """The page."""
+    parts = [f"# Ablation: {about}", _errors(runs, arms, groups["all"]), NOTE, "## Does it help", PAIRED]
+    parts += [_paired(runs, arms, groups)]
+    parts += ["![difference of the path's error](difference.svg)"] if drawn else []
+    if len(groups["all"]) > 1:
+        parts += ["## Sequence by sequence: ATE, percent of that of I", _by_sequence(runs, arms, groups["all"])]
+    return "\n\n".join(parts) + "\n"
+
+
+def _errors(runs: Sequence[Run], arms: Sequence[Arm], sequences: Sequence[str]) -> str:
+    head = ("arm", "mapping", "tracking", "loop", *sequences, "mean", "PSNR", "lost", "paper")
     rows = []
-    for row in ROWS:
-        runs = results.of(row, seeds)
-        errors = [run.ate_rmse_cm for run in runs]
-        spread = f"{statistics.stdev(errors):.3f}" if len(errors) > 1 else "-"
-        means = f"{statistics.fmean(errors):.3f}", spread, f"{min(errors):.3f}", f"{max(errors):.3f}"
-        switches = ("yes" if on else "-" for on in row.switches.values())
-        rows.append((row.method, *switches, *means, str(sum(run.frames_lost for run in runs)), f"{row.published_cm}"))
-    return rows
+    for arm in arms:
+        own = [run for run in runs if run.arm == arm.name]
+        if not own:
+            continue
+        by_sequence = [[run.ate_rmse_cm for run in own if run.sequence == name] for name in sequences]
+        means = [statistics.fmean(values) for values in by_sequence if values]
+        places = ("yes" if on else "-" for on in arm.switches.values())
+        psnr = [run.psnr for run in own if run.psnr is not None]
+        cells = (f"{statistics.fmean(means):.3f}", f"{statistics.fmean(psnr):.2f}" if psnr else "-")
+        published = f"{arm.published_cm}" if arm.published_cm else ""
+        lost = str(sum(run.frames_lost for run in own))
+        rows.append((arm.name, *places, *map(_spread, by_sequence), *cells, lost, published))
+    return tables.markdown(head, rows, left=4)
 
 
-def table(results: Results, seeds: Sequence[int]) -> str:
-    """For a terminal."""
-    lines = [_HEAD, *_cells(results, seeds)]
-    return "\n".join(
-        "".join(f"{cell:<10}" for cell in line[:4]) + "".join(f"{cell:>10}" for cell in line[4:]) for line in lines
-    )
+def _spread(values: Sequence[float]) -> str:
+    if not values:
+        return "-"
+    mean = f"{statistics.fmean(values):.3f}"
+    return f"{mean} ± {statistics.stdev(values):.3f}" if len(values) > 1 else mean
 
 
-def markdown(results: Results, seeds: Sequence[int]) -> str:
-    """For a page."""
-    return tables.markdown(_HEAD, _cells(results, seeds), left=4)
+def _paired(runs: Sequence[Run], arms: Sequence[Arm], groups: Mapping[str, Sequence[str]]) -> str:
+    rows = []
+    told = {arm.name: arm.told for arm in arms}
+    for group, sequences in groups.items():
+        colors = {one.arm: one for one in differences(runs, sequences, "psnr")}
+        for one in differences(runs, sequences):
+            psnr = _interval(colors[one.arm], 2) if one.arm in colors else ("-", "-")
+            p = "-" if math.isnan(one.p_of_pairs) else f"{one.p_of_pairs:.3f}"
+            rows.append((group, one.arm, told[one.arm], *_interval(one, 1), p, *psnr, str(one.pairs)))
+    head = ("sequences", "arm", "guides", "ATE %", "95 % interval", "p", "PSNR dB", "95 % interval", "pairs")
+    return tables.markdown(head, rows, left=3) if rows else "There is no pair yet."
+
+
+def _by_sequence(runs: Sequence[Run], arms: Sequence[Arm], sequences: Sequence[str]) -> str:
+    found = {name: {one.arm: one for one in differences(runs, [name])} for name in sequences}
+    rows = []
+    for arm in arms[1:]:
+        cells = (_told(found[name].get(arm.name)) for name in sequences)
+        rows.append((arm.name, *cells))
+    return tables.markdown(("arm", *sequences), rows)
+
+
+def _told(one: PairedDifference | None) -> str:
+    if one is None:
+        return "-"
+    mean, interval = _interval(one, 1)
+    return f"{mean} ({interval})" if one.pairs >= PER_SEQUENCE else mean
+
+
+def _interval(one: PairedDifference, decimals: int) -> tuple[str, str]:
+    """Mean, and the interval around it."""
+    interval = "-" if math.isnan(one.low) else f"{one.low:+.{decimals}f} … {one.high:+.{decimals}f}"
+    return f"{one.mean:+.{decimals}f}", interval

@@ -110,9 +110,14 @@ def command(args: Track, settings: Mapping[str, str]) -> int:
 
 def measured(sequence: datasets.Sequence, config: SlamConfig, rasterizer: Rasterizer) -> Timed:
     """SLAM through a whole sequence, once its kernels are compiled, timed frame by frame."""
-    torch.set_num_threads(1)  # as `recorded` does, which says why
     compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
-    slam, lost = Slam(config, rasterizer), 0
+    return through(Slam(config, rasterizer), sequence)
+
+
+def through(slam: Slam, sequence: datasets.Sequence) -> Timed:
+    """A system that has seen nothing yet, through a whole sequence and finished, timed frame by frame."""
+    torch.set_num_threads(1)  # as `recorded` does, which says why
+    lost = 0
     seconds: list[Mapping[str, float]] = []
     updates: list[float] = []
     with RunProgress(len(sequence)) as progress:
