@@ -1,12 +1,16 @@
 """`tcgsplat bench SUITE`: what is run, what is not run again, and what the page says of it."""
 
+import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -32,25 +36,51 @@ QUICK = ["--mapper.iterations", "3", "--mapper.first-iterations", "5", "--schedu
 DESK, XYZ = "rgbd_dataset_freiburg1_desk", "rgbd_dataset_freiburg2_xyz"
 
 
-def record_room(root: Path) -> None:
-    """Eight frames of the analytic room, as in the TUM benchmark."""
-    poses, seconds = walk(8), np.arange(8) / 30
+FRAMES = 12
+"""Two of which are predicted before they are used, the first one from no map at all."""
+
+
+def record_room(root: Path, *, truth: bool) -> None:
+    """The analytic room, as in the TUM benchmark; its depth is exact."""
+    poses, seconds = walk(FRAMES), np.arange(FRAMES) / 30
     root.mkdir(parents=True)
     files = sequence_files(root, "tum", seconds, ())
-    (root / "truth").rmdir()  # of synthetic recordings alone
+    if truth:
+        files.write_events(())
+    else:
+        (root / "truth").rmdir()
     for index, T_world_cam in enumerate(poses):
         frame = Room().frame(T_world_cam, index, Camera(70.0, 70.0, 39.5, 29.5, 80, 60))
         color = (255 * frame.color.clamp(0, 1)).round().byte().numpy()
         files.write_frame(index, color, frame.depth.double().numpy(), None)
-    files.write_index(View(80, 60, 70.0, 39.5, 29.5), seconds, torch.stack(poses).numpy(), np.ones(8, dtype=bool))
+    files.write_index(View(80, 60, 70.0, 39.5, 29.5), seconds, torch.stack(poses).numpy(), np.ones(FRAMES, dtype=bool))
 
 
-@pytest.fixture
-def data(tmp_path: Path) -> Path:
-    """Two of the five sequences of the TUM suite."""
-    for name in (DESK, XYZ):
-        record_room(tmp_path / "data" / name)
-    return tmp_path / "data"
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two of the five sequences of the TUM suite, with the same frames; of the first one the truth is known."""
+    folder = tmp_path_factory.mktemp("data")
+    record_room(folder / DESK, truth=True)
+    record_room(folder / XYZ, truth=False)
+    return folder
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A bench that has ended."""
+
+    out: Path
+    told: str
+    complained: str
+
+
+@pytest.fixture(scope="module")
+def ran(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Ran:
+    """Both sequences with two presets."""
+    out = tmp_path_factory.mktemp("bench") / "out"
+    with redirect_stdout(io.StringIO()) as told, redirect_stderr(io.StringIO()) as complained:
+        assert main(ask(data, out, "--seeds", "1", "--seed", "5")) == 0
+    return Ran(out, told.getvalue(), complained.getvalue())
 
 
 def ask(data: Path, out: Path, *more: str) -> list[str]:
@@ -66,14 +96,10 @@ def stamps(out: Path, name: str) -> dict[str, int]:
     return {str(path.relative_to(out)): path.stat().st_mtime_ns for path in out.glob(f"runs/*/*/*/{name}")}
 
 
-def test_a_suite_runs_what_is_there_and_names_what_is_not(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    out = tmp_path / "out"
-    assert main(ask(data, out, "--seeds", "1", "--seed", "5")) == 0
-    told = capsys.readouterr()
-    assert told.out.startswith("4 of 4 runs: ")
-    assert f"fr1/room is left out: no files in {data / 'rgbd_dataset_freiburg1_room'}" in told.err
+def test_a_suite_runs_what_is_there_and_names_what_is_not(data: Path, ran: Ran):
+    out = ran.out
+    assert ran.told.startswith("4 of 4 runs: ")
+    assert f"fr1/room is left out: no files in {data / 'rgbd_dataset_freiburg1_room'}" in ran.complained
     runs = results(out)
     done = {key for key, run in runs.items() if run["state"] == "done"}
     assert done == {(name, preset, 5) for name in ("fr1/desk", "fr2/xyz") for preset in ("default", "base")}
@@ -94,34 +120,77 @@ def test_a_suite_runs_what_is_there_and_names_what_is_not(
     assert "| *TCGSplat (published)* | 1.83 | 3.52 | 6.74 | 1.45 | 3.31 | 3.37 |" in text
     assert f"- fr1/room: no files in {data / 'rgbd_dataset_freiburg1_room'}" in text
     assert "`mapper.iterations = 3`" in text
-    for figure in ("ate.svg", "psnr.svg", "difference.svg"):
+    for figure in ("ate.svg", "psnr.svg", "difference.svg", "sparsification.svg"):
         assert f"]({figure})" in text
         assert (out / figure).read_text().startswith("<?xml")
 
 
-def test_what_is_finished_is_not_run_again(data: Path, tmp_path: Path):
-    out = tmp_path / "out"
-    one = ["--sequences", "fr1/desk", "--presets", "default", "--limit", "6"]
-    assert main(ask(data, out, *one, "--seeds", "1")) == 0
-    report, summary = stamps(out, "report.json"), stamps(out, "summary.json")
-    (first,) = report
-    assert main(ask(data, out, *one, "--seeds", "2")) == 0
-    assert stamps(out, "report.json")[first] == report[first]
-    assert len(stamps(out, "report.json")) == 2
+def test_a_run_whose_truth_is_known_is_watched(ran: Ran):
+    runs = results(ran.out)
+    for preset in ("default", "base"):
+        told = runs["fr1/desk", preset, 5]["confidence"]
+        assert told["frames"] == 1
+        assert set(told["depth"]) == {"confidence", "opacity", "observations", "previous residual", "depth edge"}
+        assert 0 < told["depth"]["confidence"]["ause"] < 2
+        assert runs["fr2/xyz", preset, 5]["confidence"] is None
+    text = (ran.out / "README.md").read_text()
+    ause, rival = (runs["fr1/desk", "default", 5]["confidence"]["depth"][m]["ause"] for m in ("confidence", "opacity"))
+    assert f"| fr1/desk | `default` | {ause:.2f} | {rival:.2f} |" in text
+    assert "| fr2/xyz | `default` | 5 | done |" in text
+    assert text.count("| fr2/xyz | `default` |") == 1, "not in the table of confidence"
 
-    (out / first).unlink()  # as if stopped between the run and its evaluation
-    assert main(ask(data, out, *one, "--seeds", "1")) == 0
-    assert stamps(out, "summary.json")[first.replace("report", "summary")] in summary.values()
+
+def test_watching_changes_neither_path_nor_map(ran: Ran):
+    """The two sequences have the same frames, and one of them is watched."""
+    watched, alone = (ran.out / "runs" / name / "default" / "5" for name in ("fr1-desk", "fr2-xyz"))
+    assert (watched / "confidence.json").is_file() and not (alone / "confidence.json").exists()
+    files = {"trajectory.npz", "trajectory.txt", *(f"submaps/{path.name}" for path in (alone / "submaps").iterdir())}
+    assert len(files) > 2
+    for name in files:
+        assert (watched / name).read_bytes() == (alone / name).read_bytes(), name
+
+
+def test_what_is_finished_is_not_run_again(data: Path, ran: Ran, tmp_path: Path):
+    out = shutil.copytree(ran.out, tmp_path / "out")
+    one = ["--sequences", "fr2/xyz", "--presets", "default", "--seed", "5", "--seeds", "1"]
+    (first,) = (name for name in stamps(out, "summary.json") if "fr2-xyz/default" in name)
+    summary, report = stamps(out, "summary.json")[first], stamps(out, "report.json")
+
+    assert main(ask(data, out, *one)) == 0
+    assert stamps(out, "report.json") == report
     assert len(results(out)) == 1
 
-    changed = ["--tracker.smoothing", "false"]
-    assert main(ask(data, out, *one, "--seeds", "1", *changed)) == 0
-    assert stamps(out, "summary.json")[first.replace("report", "summary")] not in summary.values()
+    report_path = out / first.replace("summary", "report")
+    report_path.unlink()  # as if stopped between the run and its evaluation
+    assert main(ask(data, out, *one)) == 0
+    assert report_path.is_file()
+    assert stamps(out, "summary.json")[first] == summary
+
+    assert main(ask(data, out, *one, "--tracker.smoothing", "false", "--limit", "6")) == 0
+    assert stamps(out, "summary.json")[first] != summary
+
+
+def test_a_watched_run_that_was_stopped_begins_anew(data: Path, ran: Ran, tmp_path: Path):
+    """Its observer's memory is gone; with `confidence.json` there, only the evaluation is made up for."""
+    out = shutil.copytree(ran.out, tmp_path / "out")
+    one = ["--sequences", "fr1/desk", "--presets", "default", "--seed", "5", "--seeds", "1"]
+    run = out / "runs" / "fr1-desk" / "default" / "5"
+    told, summary = (run / "confidence.json").read_bytes(), (run / "summary.json").stat().st_mtime_ns
+
+    (run / "report.json").unlink()
+    assert main(ask(data, out, *one)) == 0
+    assert (run / "summary.json").stat().st_mtime_ns == summary
+
+    for name in ("report.json", "confidence.json"):
+        (run / name).unlink()
+    assert main(ask(data, out, *one)) == 0
+    assert (run / "summary.json").stat().st_mtime_ns != summary
+    assert (run / "confidence.json").read_bytes() == told
 
 
 def test_a_run_that_fails_is_a_row_and_the_rest_goes_on(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out, data = tmp_path / "out", shutil.copytree(data, tmp_path / "data")
     (data / DESK / "depth.txt").unlink()
-    out = tmp_path / "out"
     assert main(ask(data, out, "--presets", "default", "--seeds", "1", "--limit", "6")) == 0
     runs = results(out)
     assert runs["fr2/xyz", "default", 0]["state"] == "done"

@@ -22,11 +22,15 @@ from tcgsplat.datasets import Sequence, open_sequence
 from tcgsplat.datasets.playback import Arrival, Clock, in_turn, play
 from tcgsplat.errors import ArchiveError
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.slam import Slam, StepReport
+from tcgsplat.scene.frame import Frame
+from tcgsplat.slam import Reference, Slam, StepReport
 from tcgsplat.storage import atomic
 from tcgsplat.storage.run_directory import RunDirectory, is_free
 
 logger = logging.getLogger(__name__)
+
+Watch = Callable[[Frame, Reference, Reference, StepReport], object]
+"""Called after a step: with its frame, the reference that it was tracked against, that of the next one, its report."""
 
 MAX_HELD = 0.05
 """Share of a real-time run in which reading may have stopped the camera's clock without a word about it."""
@@ -113,6 +117,7 @@ def recorded(
     preset: str,
     *,
     realtime: bool = False,
+    watch: Watch | None = None,
 ) -> Summary:
     """A whole run with progress on the terminal, or what is left of one; its summary is on disk too.
 
@@ -123,6 +128,7 @@ def recorded(
         run: Where to write.
         preset: What the settings started from, for the summary.
         realtime: Play the frames at the pace of their time stamps and drop those that come too fast.
+        watch: Sees every step, as in `record`.
 
     Raises:
         KeyboardInterrupt: at the second Ctrl-C, saying what is on disk.
@@ -147,7 +153,7 @@ def recorded(
             # `stop.wait`, so that nobody has to wait for the camera's next frame when the run is to stop
             closing(play(frames, Clock(sleep=stop.wait)) if realtime else in_turn(frames)) as arrivals,
         ):
-            summary = record(slam, arrivals, run, progress.observe, stop.is_set)
+            summary = record(slam, arrivals, run, progress.observe, stop.is_set, watch)
     except KeyboardInterrupt as interrupt:
         saved = f"{run.submap_count} submaps sealed before are saved"
         raise KeyboardInterrupt(f"stopped at once; {saved}: {run.path}") from interrupt
@@ -174,6 +180,7 @@ def record(
     run: RunDirectory,
     observe: Callable[[StepReport, int], object],
     stopped: Callable[[], bool],
+    watch: Watch | None = None,
 ) -> Summary:
     """Step SLAM through the frames.
 
@@ -183,19 +190,25 @@ def record(
         run: Where to write the path at the end.
         observe: Called with every report, and the number of frames dropped before it.
         stopped: Asked after every frame; if true, what there is gets sealed and the run ends.
+        watch: Sees every step. Its time is in none of the summary's, but mapping goes on beside it.
 
     Returns:
         The summary, not yet written: the caller knows more about the run.
     """
     tally = Tally()
     started = before = time.perf_counter()
+    watching = 0.0
     for arrival in arrivals:
+        reference = slam.reference
         report = slam.step(arrival.frame)
         tally.follow(arrival, time.perf_counter())
         observe(report, arrival.dropped)
         now = time.perf_counter()
         tally.count(report, now - before - arrival.waited)
-        before = now
+        if watch is not None:
+            watch(arrival.frame, reference, slam.reference, report)
+        before = time.perf_counter()
+        watching += before - now
         if stopped():
             break
     interrupted = stopped()
@@ -206,7 +219,7 @@ def record(
         slam.closures,
         submaps=run.submap_count,
         gaussians=run.gaussians,
-        seconds=time.perf_counter() - started,
+        seconds=time.perf_counter() - started - watching,
         interrupted=interrupted,
     )
     return replace(summary, depth_delay_ms=1e3 * slam.delay.seconds)

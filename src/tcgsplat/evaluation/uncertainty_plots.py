@@ -57,7 +57,14 @@ def write(path: Path, figure: Figure) -> None:
     atomic.write_bytes(path, content.getvalue())
 
 
-def sparsification_plot(maps: Mapping[str, Sequence[Sparsification]], *, title: str = "", width: int = 1200) -> Figure:
+def sparsification_plot(
+    maps: Mapping[str, Sequence[Sparsification]],
+    *,
+    scores: Mapping[str, float] | None = None,
+    what: str = "image",
+    title: str = "",
+    width: int = 1200,
+) -> Figure:
     """Error of the pixels left, over the share removed: mean over images of each map, of random and of the oracle.
 
     Each curve is relative to the error of all pixels of its image, so that images count the same. The first map is
@@ -66,6 +73,8 @@ def sparsification_plot(maps: Mapping[str, Sequence[Sparsification]], *, title: 
 
     Args:
         maps: Curves of one or more images by the map's name, all with the same shares removed; ours first.
+        scores: AUSE over random by the map's name, where it is another mean than that over the curves.
+        what: A curve is of: an image, or all images of a run.
         title: Above the panel: what the error is, and of which images.
         width: Pixels.
 
@@ -76,7 +85,8 @@ def sparsification_plot(maps: Mapping[str, Sequence[Sparsification]], *, title: 
     for name in (name for name, curves in scored.items() if not curves):
         raise EvaluationError(f"no image of {name!r} has any error; there is no sparsification to draw")
     relative = {name: np.stack([curve.error / curve.random for curve in curves]) for name, curves in scored.items()}
-    scores = {name: _mean(curve.normalised_ause for curve in curves) for name, curves in scored.items()}
+    if scores is None:
+        scores = {name: _mean(curve.normalised_ause for curve in curves) for name, curves in scored.items()}
     lines = [replace(line, value=f"{scores[line.name]:.2f}") for line in _lines(maps)]
     random = _Line("random", "1.00", _GREY, (0, (5, 4)), 1.6)
     oracle = _Line("oracle", "0.00", "black", (0, (1, 1.5)), 2.0)
@@ -97,7 +107,7 @@ def sparsification_plot(maps: Mapping[str, Sequence[Sparsification]], *, title: 
     _label(panel, "most uncertain pixels removed [%]", "error of the rest / error of all")
     ranked = sorted(lines, key=lambda line: (math.isnan(scores[line.name]), scores[line.name]))
     _legend(figure, width - legend + 24, top, legend - 24, [*ranked, random, oracle], "AUSE / random")
-    images = f"mean of {len(ours)} images" if len(ours) > 1 else "one image"
+    images = f"mean of {len(ours)} {what}s" if len(ours) > 1 else f"one {what}"
     canvas.write(figure, left, top / 2, ": ".join(part for part in (title, images) if part), size=_TEXT, align="left")
     return figure
 
@@ -319,8 +329,8 @@ def _legend(figure: Figure, x: Pixels, y: Pixels, width: Pixels, lines: Sequence
     for i, line in enumerate(lines, start=1):
         middle = row * (i + 0.5)
         box.plot((0, 44), (middle, middle), **line.style)
-        box.text(100, middle, line.value, ha="right", va="center", size=_TEXT, color=canvas.INK)
-        box.text(114, middle, line.name, ha="left", va="center", size=_TEXT, color=canvas.INK)
+        box.text(124, middle, line.value, ha="right", va="center", size=_TEXT, color=canvas.INK)
+        box.text(138, middle, line.name, ha="left", va="center", size=_TEXT, color=canvas.INK)
 
 
 def _panel(figure: Figure, x: Pixels, y: Pixels, width: Pixels, height: Pixels) -> Axes:

@@ -2,10 +2,9 @@
 
 import json
 import math
-import statistics
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
@@ -14,6 +13,7 @@ import torch
 
 from tcgsplat.cli.bench import Confidence
 from tcgsplat.cli.bench.tables import markdown
+from tcgsplat.cli.bench.watching import Observer, Predictions, leave_one_out, pairs_of, summary
 from tcgsplat.cli.kernels import compile_kernels
 from tcgsplat.cli.progress import RunProgress, say
 from tcgsplat.cli.recorder import Part
@@ -23,80 +23,20 @@ from tcgsplat.config import SlamConfig, to_toml, with_settings
 from tcgsplat.datasets.truth import Event, Truth
 from tcgsplat.errors import EvaluationError
 from tcgsplat.evaluation import ate
-from tcgsplat.evaluation.prediction import OURS, Judged, Seen, claim, of_color, of_depth, seen
+from tcgsplat.evaluation.prediction import OURS, Judged, claim, of_depth
 from tcgsplat.evaluation.reaction import reaction
-from tcgsplat.evaluation.uncertainty import Reliability, Scores, Sparsification, auroc, calibrated, reliability
+from tcgsplat.evaluation.uncertainty import Reliability, Sparsification
 from tcgsplat.evaluation.uncertainty_plots import reliability_plot, sparsification_plot, write
-from tcgsplat.geometry import se3
 from tcgsplat.render.backends import open_rasterizer
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.render.view import render_view
-from tcgsplat.scene.frame import Frame
-from tcgsplat.slam import Reference, Slam, StepReport
+from tcgsplat.slam import Slam
 from tcgsplat.storage import atomic
 from tcgsplat.storage.store import InMemory
-from tcgsplat.tensors import Mask, Pose
 
 MODELS: Final = ("expectation", "paper")
 """Models of confidence that are compared; the first is the default."""
 SHOWN: Final = ("shuffled", "opacity", "observations", "previous residual", "depth edge")
 """Of the other measures, in the plot."""
-ENOUGH: Final = 50
-"""Pixels that a fault must have in a picture to be looked for."""
-
-
-@dataclass
-class Predictions:
-    """What was claimed of the frames of one way through a sequence, and how it turned out."""
-
-    depth: list[Judged] = field(default_factory=list)
-    color: list[Judged] = field(default_factory=list)
-    mean: dict[int, float] = field(default_factory=dict)
-    """Rendered confidence over opacity, by frame index: mean over what is mapped."""
-    fault_auroc: list[float] = field(default_factory=list)
-    """Of doubt, in telling the pixels of a known fault from all others, once the frame has been used."""
-
-
-class Observer:
-    """Predicts every so many-th frame of a run from what the system knew before the frame came."""
-
-    def __init__(self, truth: Truth, config: SlamConfig, rasterizer: Rasterizer, every: int) -> None:
-        self.found = Predictions()
-        self._truth, self._config, self._rasterizer, self._every = truth, config, rasterizer, every
-        self._rng = np.random.default_rng(config.seed)
-        self._previous: Seen | None = None
-        self._used: tuple[Frame, Mask | None, Pose, int] | None = None
-
-    def observe(self, frame: Frame, before: Reference, after: Reference, report: StepReport) -> None:
-        """After a step: `before` is what the frame was tracked against, `after` what the next one will be."""
-        due = frame.index % self._every == 0 and report.tracked.converged and report.sealed is None
-        if not due or not len(before.submap):
-            return
-        T_map_cam = se3.inverse(before.T_map_reference) @ report.tracked.T_map_cam
-        claimed = claim(
-            before.submap, frame.camera, T_map_cam, self._rasterizer, self._config.confidence, self._rng, self._previous
-        )
-        self._previous = seen(claimed, frame.depth, T_map_cam, before.submap.index)
-        true_depth, fault = self._truth.depth(frame.index), self._truth.fault(frame.index)
-        right = frame.valid if fault is None else frame.valid & ~fault
-        if true_depth is not None:
-            self.found.depth.append(of_depth(claimed, true_depth, frame.valid, self._rng))
-        shown = report.tracked.exposure.applied(before.exposure.applied(claimed.rendering.color))
-        self.found.color.append(of_color(claimed, shown.clamp(0, 1), frame.color, right, self._rng))
-        if self._used is not None and self._used[-1] == after.submap.index:
-            self._follow(after, *self._used[:-1])
-        self._used = frame, fault, se3.inverse(after.T_map_reference) @ report.tracked.T_map_cam, after.submap.index
-
-    def _follow(self, after: Reference, frame: Frame, fault: Mask | None, T_map_cam: Pose) -> None:
-        """What the map says of an earlier view, whose frame it has used by now."""
-        rendering = render_view(after.submap, frame.camera, T_map_cam, self._rasterizer)
-        mapped = rendering.depth > 0
-        if not bool(mapped.any()):
-            return
-        trust = rendering.confidence[mapped] / rendering.alpha[mapped]
-        self.found.mean[frame.index] = float(trust.mean())
-        if fault is not None and int((fault & mapped).sum()) >= ENOUGH:
-            self.found.fault_auroc.append(auroc(-trust.numpy().astype(np.float64), fault[mapped].numpy()))
 
 
 @dataclass(frozen=True)
@@ -133,7 +73,7 @@ def command(args: Confidence, settings: Mapping[str, str]) -> int:
             arm, found = performed(folder, with_settings(config, {"confidence.model": model}), rasterizer, args.every)
             arms.append(arm)
             judged[model][arm.sequence] = found.depth
-    reliabilities = leave_one_out(judged[MODELS[0]])
+    reliabilities = leave_one_out({name: pairs_of(frames) for name, frames in judged[MODELS[0]].items()})
     calibration = {name: one.normalised_ece for name, one in reliabilities.items()}
     about = f"{rasterizer.name}, preset {args.preset}, seed {config.seed}; {machine()}"
     _draw(out, judged, reliabilities)
@@ -181,7 +121,6 @@ def performed(folder: Path, config: SlamConfig, rasterizer: Rasterizer, every: i
         claimed = claim(submap, frame.camera, row.T_map_cam, rasterizer, config.confidence, rng)
         if depth is not None:
             kept_back.append(of_depth(claimed, depth, frame.valid, rng))
-    aurocs = [value for value in found.fault_auroc if math.isfinite(value)]
     arm = Arm(
         truth.sequence.name,
         config.confidence.model,
@@ -190,7 +129,7 @@ def performed(folder: Path, config: SlamConfig, rasterizer: Rasterizer, every: i
         summary(found.depth),
         summary(found.color),
         summary(kept_back),
-        statistics.fmean(aurocs) if aurocs else None,
+        found.mean_fault_auroc,
         [_told(event, found, len(truth.numbers)) for event in truth.events],
     )
     return arm, found
@@ -214,45 +153,6 @@ def _told(event: Event, found: Predictions, frames: int) -> dict[str, object]:
 
 def _is_nan(value: object) -> bool:
     return isinstance(value, float) and math.isnan(value)
-
-
-def summary(judged: Iterable[Judged]) -> dict[str, dict[str, float | None]]:
-    """Scores of all frames: means, and of the rank correlation the median and the tenth percentile."""
-    by_measure: dict[str, list[Scores]] = {}
-    for one in judged:
-        for name, scores in one.scores.items():
-            by_measure.setdefault(name, []).append(scores)
-
-    def over(values: Iterable[float], reduce: Callable[[list[float]], float]) -> float | None:
-        finite = [value for value in values if math.isfinite(value)]
-        return float(reduce(finite)) if finite else None
-
-    return {
-        name: {
-            "ause": over((one.normalised_ause for one in scores), statistics.fmean),
-            "spearman": over((one.spearman for one in scores), statistics.median),
-            "spearman_p10": over((one.spearman for one in scores), lambda x: float(np.quantile(x, 0.1))),
-            "partial_spearman": over((one.partial_spearman for one in scores), statistics.median),
-            "auroc": over((one.auroc for one in scores), statistics.fmean),
-        }
-        for name, scores in by_measure.items()
-    }
-
-
-def leave_one_out(judged: Mapping[str, Sequence[Judged]]) -> dict[str, Reliability]:
-    """By sequence: expected against found errors, the expectation fitted to all the other sequences."""
-    pairs = {
-        name: (np.concatenate([one.doubt for one in frames]), np.concatenate([one.error for one in frames]))
-        for name, frames in judged.items()
-        if frames
-    }
-    found = {}
-    for name, (doubt, error) in pairs.items():
-        others = [pair for other, pair in pairs.items() if other != name]
-        if others:
-            fitted = calibrated(*(np.concatenate(column) for column in zip(*others, strict=True)))
-            found[name] = reliability(fitted.expected_error(doubt), error)
-    return found
 
 
 def _draw(

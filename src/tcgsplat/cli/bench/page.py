@@ -93,7 +93,7 @@ def page(results: Results, figures: Mapping[str, object] | None = None) -> str:
         _picture(figures, "difference.svg", "Difference of ATE RMSE between presets, on the same data and seeds"),
         "## Runtime",
         tables.runtime(outcomes, suite),
-        confidence_section(results),
+        confidence_section(results, figures),
         "## Every run",
         tables.runs(outcomes),
         "## Configuration and versions",
@@ -102,10 +102,18 @@ def page(results: Results, figures: Mapping[str, object] | None = None) -> str:
     return "\n\n".join(section for section in sections if section) + "\n"
 
 
-def confidence_section(results: Results) -> str:
-    """Whether confidence tells the truth: the place of its tables and figures on the page."""
-    del results
-    return ""
+def confidence_section(results: Results, figures: Mapping[str, object]) -> str:
+    """Whether confidence tells the truth, where that is known; nothing where it is not."""
+    table = tables.confidence(results.outcomes, results.suite)
+    if not table:
+        return ""
+    parts = (
+        "## Is confidence true",
+        table,
+        _picture(figures, "sparsification.svg", "Depth error left over the share of the most doubtful pixels removed"),
+        _picture(figures, "reliability.svg", "Depth error found over depth error expected, by sequence"),
+    )
+    return "\n\n".join(part for part in parts if part)
 
 
 def _about(results: Results) -> str:

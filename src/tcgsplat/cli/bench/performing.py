@@ -6,23 +6,27 @@ import logging
 import shutil
 from collections.abc import Mapping
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from tcgsplat.cli import refine
 from tcgsplat.cli.bench.suites import Source
+from tcgsplat.cli.bench.watching import Observer, Watched
 from tcgsplat.cli.progress import counting
 from tcgsplat.cli.recorder import Part, begin, recorded, resume
 from tcgsplat.cli.scoring import scored
 from tcgsplat.cli.summary import versions
-from tcgsplat.config import from_toml
+from tcgsplat.config import SlamConfig, from_toml
 from tcgsplat.datasets.synthetic import synthesize
+from tcgsplat.datasets.truth import Truth
 from tcgsplat.errors import ArchiveError, DatasetError, EvaluationError, TCGSplatError
 from tcgsplat.evaluation.metrics import Metric, Report
+from tcgsplat.evaluation.prediction import OURS
 from tcgsplat.evaluation.surface import true_mesh_path
 from tcgsplat.render.backends import open_rasterizer
+from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.storage import atomic
 from tcgsplat.storage.run_directory import RunDirectory
 
@@ -31,7 +35,16 @@ logger = logging.getLogger(__name__)
 State = Literal["done", "lost", "failed", "missing", "waiting"]
 MOST_LOST = 0.5
 """Share of lost frames above which a run counts as lost: the error of what is left of its path says nothing."""
-KEPT = ("config.toml", "request.json", "summary.json", "report.json", "bench.json", "trajectory.txt", "run.json")
+WATCHED = "confidence.json"
+"""In a run directory: what watching the run has shown of its confidence."""
+WATCHED_EVERY: Final = 10
+"""Frames: so few that watching takes about a tenth of a run's time."""
+RIVALS: Final = ("opacity", "observations", "previous residual", "depth edge")
+"""Other measures of doubt, which cost little and confidence has to beat."""
+KEPT = (
+    *("config.toml", "request.json", "summary.json", "report.json", "bench.json", "trajectory.txt", "run.json"),
+    WATCHED,
+)
 """Small files of a run, which a worker on another machine gives back."""
 
 
@@ -78,6 +91,7 @@ class Job:
             "lpips": None if self.lpips is None else str(self.lpips),
             "refine": self.refine,
             "views": [self.stride, self.withheld_every],
+            "watched": [WATCHED_EVERY, *RIVALS],
             "surface": find_spec("open3d") is not None,
             "versions": versions(),
             "config": self.config_toml,
@@ -107,6 +121,8 @@ class Outcome:
     """Of the run: times by stage, versions, machine."""
     place: str = ""
     """Of its run directory, below that of the suite; config.toml in it has its settings in full."""
+    watched: Watched | None = None
+    """What its confidence told, where the truth is known."""
 
     @property
     def key(self) -> tuple[str, str, int]:
@@ -122,7 +138,10 @@ class Outcome:
         """For `results.json`."""
         metrics = {name: {"value": metric.value, "unit": metric.unit} for name, metric in self.metrics.items()}
         config = f"{self.place}/config.toml" if self.place else None
-        return {**asdict(self), "metrics": metrics, "config": config}
+        confidence = None if self.watched is None else self.watched.figures
+        plain = asdict(replace(self, watched=None))
+        del plain["watched"]
+        return {**plain, "metrics": metrics, "config": config, "confidence": confidence}
 
     @staticmethod
     def without(job: Job, state: State, why: str) -> "Outcome":
@@ -133,8 +152,7 @@ class Outcome:
 def performed(job: Job, path: Path) -> Report:
     """Run and score a job; what it was resumed from is used where it is of the same job.
 
-    This is `tcgsplat run --resume`, `refine` and `eval`, in one process; whoever wants to see every step of SLAM puts
-    an observer here.
+    This is `tcgsplat run --resume`, `refine` and `eval`, in one process; where the truth is known, the run is watched.
 
     Args:
         job: Its data must be there.
@@ -145,12 +163,17 @@ def performed(job: Job, path: Path) -> Report:
         KeyboardInterrupt: at Ctrl-C; the frames that were mapped are kept.
     """
     config, rasterizer = from_toml(job.config_toml), open_rasterizer(job.backend)  # type: ignore[arg-type]
-    sequence = job.part.open(job.folder)
-    run = _begun(job, path)
+    sequence, truth = job.part.open(job.folder), Truth.of(job.folder, **asdict(job.part))
+    run = _begun(job, path, watched=truth is not None)
     if not run.summary() or run.summary().get("interrupted"):
-        summary = recorded(sequence, config, rasterizer, run, job.preset)
+        observer = None if truth is None else _observer(truth, config, rasterizer)
+        summary = recorded(
+            sequence, config, rasterizer, run, job.preset, watch=None if observer is None else observer.observe
+        )
         if summary.interrupted:
             raise KeyboardInterrupt(f"stopped; saved {summary}: {run.path}")
+        if observer is not None:
+            Watched.of(observer.found).write(path / WATCHED)
     if job.refine and not (path / "map.npz").exists():
         with redirect_stdout(io.StringIO()):  # the report tells the same
             stopped = refine.command(refine.Args(path, steps=job.refine, backend=job.backend))
@@ -167,10 +190,19 @@ def performed(job: Job, path: Path) -> Report:
         return scored(run, sequence, rasterizer, job.stride, job.withheld_every, job.lpips)
 
 
-def _begun(job: Job, path: Path) -> RunDirectory:
-    """The run directory of the same job, finished or not; or a new one in the place of what is there."""
+def _observer(truth: Truth, config: SlamConfig, rasterizer: Rasterizer) -> Observer:
+    return Observer(truth, config, rasterizer, WATCHED_EVERY, color=False, measures=(OURS, *RIVALS))
+
+
+def _begun(job: Job, path: Path, *, watched: bool) -> RunDirectory:
+    """The run directory of the same job, finished or not; or a new one in the place of what is there.
+
+    A run that is watched is not gone on with: what its observer saw is written at its end only, and a run takes
+    seconds.
+    """
     config = from_toml(job.config_toml)
-    if _told(path / "bench.json") == job.identity:
+    usable = not watched or Watched.read(path / WATCHED) is not None
+    if usable and _told(path / "bench.json") == job.identity:
         try:
             run = RunDirectory.open(path)
             unfinished = not run.summary() or run.summary().get("interrupted")
@@ -224,6 +256,7 @@ def finished(job: Job, out: Path) -> Outcome | None:
         evaluated=evaluated,
         summary=summary,
         place=job.place.as_posix(),
+        watched=Watched.read(path / WATCHED),
     )
 
 

@@ -1,17 +1,19 @@
 """Figures of a bench: every run a dot."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from tcgsplat.cli.bench.performing import Outcome
+from tcgsplat.cli.bench.performing import RIVALS, Outcome
 from tcgsplat.cli.bench.suites import Suite
 from tcgsplat.cli.bench.tables import paired
+from tcgsplat.cli.bench.watching import Watched, leave_one_out
 from tcgsplat.evaluation import canvas, published
+from tcgsplat.evaluation.prediction import OURS
 from tcgsplat.evaluation.published import OURS_IN_PRINT
-from tcgsplat.evaluation.uncertainty_plots import forest_plot
+from tcgsplat.evaluation.uncertainty_plots import forest_plot, reliability_plot, sparsification_plot
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Of M. Okabe and K. Ito (2008): the colour-blind tell them apart."""
@@ -36,7 +38,47 @@ def figures(outcomes: Sequence[Outcome], sequences: Sequence[str], suite: Suite)
         differences = [one for one in paired(outcomes, "ate_rmse", suite.presets[-1]) if not math.isnan(one.mean)]
         if differences:
             drawn["difference.svg"] = forest_plot(differences, measure="ATE RMSE", unit="mm", scale=10.0)
+    return drawn | _of_confidence(outcomes, sequences, suite)
+
+
+def _of_confidence(outcomes: Sequence[Outcome], sequences: Sequence[str], suite: Suite) -> dict[str, Figure]:
+    """Of the runs that were watched: the confidence of every preset beside other measures of the first one's runs, and
+    how well the first one's lets depth errors be expected.
+    """
+    runs: dict[str, list[tuple[str, Watched]]] = {}
+    for one in outcomes:
+        if one.watched is not None and one.state == "done" and one.watched.curves:
+            runs.setdefault(one.preset, []).append((one.sequence, one.watched))
+    presets = [preset for preset in suite.presets if preset in runs]
+    if not presets:
+        return {}
+    first = [run for _, run in runs[presets[0]]]
+    lines = {f"{OURS}, {preset}": (OURS, [run for _, run in runs[preset]]) for preset in presets}
+    lines |= {rival: (rival, first) for rival in RIVALS}
+    drawn = {
+        "sparsification.svg": sparsification_plot(
+            {name: [run.curves[measure] for run in of] for name, (measure, of) in lines.items()},
+            scores={name: _mean(run.score("ause", measure) for run in of) for name, (measure, of) in lines.items()},
+            what="run",
+            title="Depth error left after the most doubtful pixels are removed; predicted before seen",
+        )
+    }
+    pairs = {}
+    for name in sequences:
+        of = [run for sequence, run in runs[presets[0]] if sequence == name]
+        if of:
+            pairs[name] = np.concatenate([run.doubt for run in of]), np.concatenate([run.error for run in of])
+    reliabilities = leave_one_out(pairs)
+    if reliabilities:
+        title = f"Depth error, preset {presets[0]}, expectation fitted to the other sequences"
+        drawn["reliability.svg"] = reliability_plot(reliabilities, title=title)
     return drawn
+
+
+def _mean(values: Iterable[float | None]) -> float:
+    """Of those that are defined."""
+    defined = [value for value in values if value is not None]
+    return float(np.mean(defined)) if defined else math.nan
 
 
 def dots(

@@ -2,13 +2,15 @@
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final
 
-from tcgsplat.cli.bench.performing import Outcome
+from tcgsplat.cli.bench.performing import WATCHED_EVERY, Outcome
 from tcgsplat.cli.bench.suites import Suite
+from tcgsplat.cli.bench.watching import Watched
 from tcgsplat.evaluation import published
 from tcgsplat.evaluation.paired import paired_differences
+from tcgsplat.evaluation.prediction import BAD_METERS, BAD_SHARE
 from tcgsplat.evaluation.published import Table
 
 Outcomes = Sequence[Outcome]
@@ -129,6 +131,65 @@ def paired(outcomes: Outcomes, metric: str, reference: str) -> tuple:  # type: i
     return paired_differences(results, reference)
 
 
+def confidence(outcomes: Outcomes, suite: Suite) -> str:
+    """How well confidence told where the map was wrong, where the truth is known; empty if no run was watched."""
+    rows = []
+    for source in suite.sources:
+        for preset in suite.presets:
+            tried = [one for one in outcomes if one.state not in ("missing", "waiting")]
+            runs = [one for one in tried if (one.sequence, one.preset) == (source.name, preset)]
+            if any(one.watched for one in runs):
+                cells = (_spread((_watched(one, of) for one in runs), 2) for of in OF_CONFIDENCE.values())
+                rows.append([source.name, f"`{preset}`", *cells])
+    if not rows:
+        return ""
+    caption = (
+        f"Every {WATCHED_EVERY}th frame is drawn from the map as it was before it used the frame, at the pose that "
+        "tracking found, and doubt (1 - rendered confidence) is held against the true error of depth, pixel by pixel. "
+        "**AUSE**: error left when the most doubtful pixels are removed first, as an area above that of an oracle, "
+        "over the same for a random order: 0 is the oracle, 1 knows nothing; beside it that of two measures that are "
+        "to be had for less. **Spearman**: rank correlation of doubt and error, median over frames and 10th "
+        "percentile; **partial**: of what depth, opacity, observations and the slope of colour leave unexplained, "
+        "median. **AUROC bad**: chance that a pixel that is off by more than "
+        f"{100 * BAD_METERS:g} cm and {100 * BAD_SHARE:g} % is more doubtful than another; **AUROC fault**: the same "
+        "where the recording was wrong, as somebody was in the way, once the map has used the frame. Colour, and "
+        "frames that are never mapped, are not part of this: see `tcgsplat bench confidence`."
+    )
+    table = markdown(("sequence", "preset", *OF_CONFIDENCE), rows, left=2)
+    return f"{caption}\n\n{table}\n\n{_beaten(outcomes, suite)}"
+
+
+OF_CONFIDENCE: Final[Mapping[str, Callable[[Watched], float | None]]] = {
+    "AUSE ↓": lambda run: run.score("ause"),
+    "of opacity": lambda run: run.score("ause", "opacity"),
+    "of observations": lambda run: run.score("ause", "observations"),
+    "Spearman ↑": lambda run: run.score("spearman"),
+    "10th percentile ↑": lambda run: run.score("spearman_p10"),
+    "partial ↑": lambda run: run.score("partial_spearman"),
+    "AUROC bad ↑": lambda run: run.score("auroc"),
+    "AUROC fault ↑": lambda run: run.fault_auroc,
+}
+
+
+def _watched(one: Outcome, of: Callable[[Watched], float | None]) -> float | None:
+    """A figure of a run that counts."""
+    return of(one.watched) if one.watched and one.state == "done" else None
+
+
+def _beaten(outcomes: Outcomes, suite: Suite) -> str:
+    """In how many runs confidence has the lower AUSE."""
+    told = []
+    for preset in suite.presets:
+        done = [one.watched for one in outcomes if one.preset == preset and one.watched and one.state == "done"]
+        counts = []
+        for measure in ("opacity", "observations"):
+            both = [(run.score("ause"), run.score("ause", measure)) for run in done]
+            known = [(ours, other) for ours, other in both if ours is not None and other is not None]
+            counts.append(f"than {measure} in {sum(ours < other for ours, other in known)} of {len(known)}")
+        told.append(f"with `{preset}`, {' and '.join(counts)} runs")
+    return f"The AUSE of confidence is lower {'; '.join(told)}."
+
+
 def runtime(outcomes: Outcomes, suite: Suite) -> str:
     """Times of a frame and of its stages, and size of the map: means over all runs.
 
@@ -150,9 +211,14 @@ def runtime(outcomes: Outcomes, suite: Suite) -> str:
         cells = [NONE, _ms(tracking), _ms(mapping), *[NONE] * (len(columns) - 3)]
         rows.append([*_published(method), *cells])
     machines = sorted({str(one.summary.get("machine")) for one in outcomes if one.summary})
+    watched = (
+        f"Predicting every {WATCHED_EVERY}th frame to judge confidence is in none of these times, but mapping went on "
+        "beside it. "
+    )
     caption = (
         f"Mean ± standard deviation over all runs, on {'; '.join(machines) or 'no machine yet'}. Mapping and loop "
         "closure have threads of their own beside tracking: the published times of a frame add up, ours do not. "
+        f"{watched * any(one.watched is not None for one in outcomes)}"
         f"Published rows: mapping and tracking of a frame, on other data and another machine. "
         f"{_source(published.RUNTIME)}"
     )
