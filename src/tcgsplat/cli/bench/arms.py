@@ -24,8 +24,8 @@ from tcgsplat.tensors import Plane, Pose
 
 DRAWN: Final = 40
 """Views that were never mapped, of which the PSNR is taken."""
-AVERAGE: Final = 0.9
-"""Of the default's confidence over the Gaussians of a map, about: what the arm `constant` gives to all."""
+AVERAGE: Final = 0.85
+"""Of the confidence that a picture of the default's map has, about: what the arm `constant` gives to all."""
 FAULTS: Final = frozenset({"exposure jump", "dropped frames", "moving object", "depth bias"})
 """Events that are something wrong; the others are only something to look at."""
 
