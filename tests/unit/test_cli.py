@@ -228,7 +228,12 @@ def test_the_first_frame_does_not_count_in_times():
     assert result.ms_per_frame_median == pytest.approx(40.0)
     assert result.stage_ms == pytest.approx({"track": 20.0, "map": 40.0})
     assert str(result) == "4 frames in 21.0 s (70 ms a frame), 1 lost, 2 submaps, 2 loops closed, 30 Gaussians"
-    assert json.loads(json.dumps(result.to_dict()))["versions"]["torch"] == torch.__version__
+    versions = json.loads(json.dumps(result.to_dict()))["versions"]
+    assert versions["torch"] == torch.__version__
+    assert versions["source"] == subprocess.run(
+        [sys.executable, "-c", "from tcgsplat.cli.summary import source; print(source())"],
+        capture_output=True, check=True, text=True,
+    ).stdout.strip(), "another process finds another source"  # fmt: skip
     assert 50 < (result.peak_rss_mb or 0) < 100_000
     assert "core" in result.machine
 

@@ -1,15 +1,18 @@
 """How a run went, in numbers."""
 
+import hashlib
 import platform
 import statistics
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
+import tcgsplat
 from tcgsplat.datasets.playback import Arrival
 from tcgsplat.loop.closer import Closure
 from tcgsplat.render.numba_cpu.workers import available_cores
@@ -183,8 +186,19 @@ def peak_rss_mb() -> float | None:
 
 
 def versions() -> dict[str, str]:
-    """Of Python and of the packages that results and times depend on most."""
-    return {"python": platform.python_version()} | {package: version(package) for package in PACKAGES}
+    """Of Python, of the packages that results and times depend on most, and of our own source."""
+    packages = {package: version(package) for package in PACKAGES}
+    return {"python": platform.python_version(), **packages, "source": source()}
+
+
+@cache
+def source() -> str:
+    """Digest of all modules that results hang on, as this process found them: between releases, versions stay."""
+    package, digest = Path(tcgsplat.__file__).parent, hashlib.sha256()
+    names = sorted(path.relative_to(package) for path in package.rglob("*.py"))
+    for name in (name for name in names if name.parts[0] != "cli"):
+        digest.update(f"{name.as_posix()}\n".encode() + (package / name).read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def machine() -> str:
