@@ -269,7 +269,7 @@ def _percent(one: PairedDifference) -> PairedDifference:
 def difference_plot(runs: Sequence[Run], sequences: Sequence[str]):  # type: ignore[no-untyped-def]
     """Of the path's error, all sequences together; None without a pair."""
     found = differences(runs, sequences)
-    told = {arm.name: f"{arm.name}: {arm.told}" for arm in ARMS}
+    told = {arm.name: f"{arm.name}, {arm.told}" if arm.published_cm else arm.name for arm in ARMS}
     named = [replace(one, arm=told[one.arm], reference=told[one.reference]) for one in found]
     return forest_plot(named, measure="ATE RMSE", unit="%") if named else None
 

@@ -62,7 +62,7 @@ class Arm:
 
 
 ARMS: Final = (
-    Arm("I", "off: guides nothing", False, False, False, published_cm=14.1),
+    Arm("I", "off", False, False, False, published_cm=14.1),
     Arm("II", "mapping only", True, False, False, published_cm=12.8),
     Arm("III", "mapping, tracking", True, True, False, published_cm=12.1),
     Arm("IV", "all of it", published_cm=10.4),
