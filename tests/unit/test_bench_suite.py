@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Mapping
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -20,16 +20,19 @@ import pytest
 import torch
 from analytic_room import Room, walk
 
-from tcgsplat.cli.bench import tables
+from tcgsplat.cli.bench import plots, tables
 from tcgsplat.cli.bench.page import Results, page
-from tcgsplat.cli.bench.performing import Outcome
+from tcgsplat.cli.bench.performing import RIVALS, Outcome
 from tcgsplat.cli.bench.suites import REPLICA, SCANNET, SYNTHETIC, TUM, Suite
+from tcgsplat.cli.bench.watching import Predictions, Watched
 from tcgsplat.cli.main import main
 from tcgsplat.config import from_toml, settings
 from tcgsplat.datasets.synthetic.raster import View
 from tcgsplat.datasets.synthetic.writer import sequence_files
 from tcgsplat.evaluation import published
 from tcgsplat.evaluation.metrics import Metric
+from tcgsplat.evaluation.prediction import OURS
+from tcgsplat.evaluation.uncertainty import Sparsification
 from tcgsplat.geometry.camera import Camera
 
 QUICK = ["--mapper.iterations", "3", "--mapper.first-iterations", "5", "--schedule.map-every", "2", "--refine", "1"]
@@ -152,38 +155,31 @@ def test_watching_changes_neither_path_nor_map(ran: Ran):
 
 def test_what_is_finished_is_not_run_again(data: Path, ran: Ran, tmp_path: Path):
     out = shutil.copytree(ran.out, tmp_path / "out")
-    one = ["--sequences", "fr2/xyz", "--presets", "default", "--seed", "5", "--seeds", "1"]
-    (first,) = (name for name in stamps(out, "summary.json") if "fr2-xyz/default" in name)
-    summary, report = stamps(out, "summary.json")[first], stamps(out, "report.json")
+    one = ["--sequences", "fr1/desk", "--presets", "default", "--seed", "5", "--seeds", "1"]
+    run = out / "runs" / "fr1-desk" / "default" / "5"
+    summary, report = (run / "summary.json").stat().st_mtime_ns, stamps(out, "report.json")
 
     assert main(ask(data, out, *one)) == 0
     assert stamps(out, "report.json") == report
     assert len(results(out)) == 1
 
-    report_path = out / first.replace("summary", "report")
-    report_path.unlink()  # as if stopped between the run and its evaluation
+    (run / "report.json").unlink()  # as if stopped between the run and its evaluation
     assert main(ask(data, out, *one)) == 0
-    assert report_path.is_file()
-    assert stamps(out, "summary.json")[first] == summary
+    assert (run / "report.json").is_file()
+    assert (run / "summary.json").stat().st_mtime_ns == summary
 
-    assert main(ask(data, out, *one, "--tracker.smoothing", "false", "--limit", "6")) == 0
-    assert stamps(out, "summary.json")[first] != summary
+    assert main(ask(data, out, *one, "--tracker.smoothing", "false", "--limit", "4")) == 0
+    assert (run / "summary.json").stat().st_mtime_ns != summary
 
 
 def test_a_watched_run_that_was_stopped_begins_anew(data: Path, ran: Ran, tmp_path: Path):
-    """Its observer's memory is gone; with `confidence.json` there, only the evaluation is made up for."""
+    """What its observer had seen is gone: it is written at the end of the run."""
     out = shutil.copytree(ran.out, tmp_path / "out")
-    one = ["--sequences", "fr1/desk", "--presets", "default", "--seed", "5", "--seeds", "1"]
     run = out / "runs" / "fr1-desk" / "default" / "5"
     told, summary = (run / "confidence.json").read_bytes(), (run / "summary.json").stat().st_mtime_ns
-
-    (run / "report.json").unlink()
-    assert main(ask(data, out, *one)) == 0
-    assert (run / "summary.json").stat().st_mtime_ns == summary
-
     for name in ("report.json", "confidence.json"):
         (run / name).unlink()
-    assert main(ask(data, out, *one)) == 0
+    assert main(ask(data, out, "--sequences", "fr1/desk", "--presets", "default", "--seed", "5", "--seeds", "1")) == 0
     assert (run / "summary.json").stat().st_mtime_ns != summary
     assert (run / "confidence.json").read_bytes() == told
 
@@ -239,39 +235,47 @@ def test_a_folder_of_something_else_is_left_alone(data: Path, tmp_path: Path, ca
 
 
 def test_the_synthetic_suite_makes_its_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """All of the walk in 24 frames is far too fast: those runs are lost, and are said to be."""
-    out = tmp_path / "out"
-    tiny = ["bench", "synthetic", "--out", str(out), "--frames", "24", "--width", "64", *QUICK, "--refine", "0"]
+    """In the place of what it made with other settings. All of the walk in ten frames is far too fast: the run is lost,
+    and is said to be.
+    """
+    out, folder = tmp_path / "out", tmp_path / "out" / "data" / "moving"
+    (moving,) = (source for source in SYNTHETIC.made(500, 64).sources if source.name == "moving")
+    folder.mkdir(parents=True)
+    (folder / "old").touch()
+    folder.with_name("moving.json").write_text(json.dumps(asdict(moving.synth)))  # type: ignore[call-overload]
+    (out / "results.json").write_text('{"suite": "synthetic"}')
+
+    tiny = ["bench", "synthetic", "--out", str(out), "--frames", "10", "--width", "64", *QUICK, "--refine", "0"]
     one = ["--sequences", "moving", "--presets", "default", "--seeds", "1"]
     assert main([*tiny, *one]) == 0
     (run,) = results(out).values()
     assert run["state"] == "lost"
     assert "1 failed or lost" in capsys.readouterr().out
     assert "| moving | `default` | 0 | lost: tracking was lost in" in (out / "README.md").read_text()
-    assert (out / "data" / "moving" / "mask").is_dir()
-    before = (out / "data" / "moving" / "rgb.txt").stat().st_mtime_ns
+    assert (folder / "mask").is_dir() and not (folder / "old").exists()
+    assert len(list((folder / "rgb").iterdir())) == 10
+
+    before = (folder / "rgb.txt").stat().st_mtime_ns
     assert main([*tiny, *one]) == 0
-    assert (out / "data" / "moving" / "rgb.txt").stat().st_mtime_ns == before
-    tiny[tiny.index("24")] = "12"
-    assert main([*tiny, *one]) == 0
-    assert len(list((out / "data" / "moving" / "rgb").iterdir())) == 12
+    assert (folder / "rgb.txt").stat().st_mtime_ns == before
 
 
 @pytest.mark.slow
 def test_ctrl_c_keeps_what_is_finished_and_the_same_command_goes_on(data: Path, tmp_path: Path):
     out = tmp_path / "out"
-    arguments = ask(data, out, "--presets", "default", "--seeds", "6", "--sequences", "fr1/desk")
+    short = ["--limit", "4", "--refine", "0"]
+    arguments = ask(data, out, "--presets", "default", "--seeds", "4", "--sequences", "fr2/xyz", *short)
     process = subprocess.Popen([sys.executable, "-m", "tcgsplat.cli.main", *arguments], stderr=subprocess.PIPE)
     until(lambda: len(stamps(out, "report.json")) >= 1)
     process.send_signal(signal.SIGINT)
     told = process.communicate()[1].decode()
     assert process.returncode == 130, told
     kept = stamps(out, "report.json")
-    assert 1 <= len(kept) < 6
-    assert f"{len(kept)} of 6 runs are kept in {out}: the same command goes on" in told
+    assert 1 <= len(kept) < 4
+    assert f"{len(kept)} of 4 runs are kept in {out}: the same command goes on" in told
     states = [run["state"] for run in results(out).values()]
     assert states.count("done") == len(kept)
-    assert states.count("waiting") == 6 - len(kept)
+    assert states.count("waiting") == 4 - len(kept)
     assert "waiting: not run yet" in (out / "README.md").read_text()
     assert main(arguments) == 0
     assert {run["state"] for run in results(out).values()} == {"done"}
@@ -282,7 +286,9 @@ def test_ctrl_c_keeps_what_is_finished_and_the_same_command_goes_on(data: Path, 
 @pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed: pip install 'tcgsplat[cluster]'")
 def test_a_worker_that_is_killed_costs_one_run_which_is_tried_again(data: Path, tmp_path: Path):
     out = tmp_path / "out"
-    arguments = ask(data, out, "--presets", "default", "--seeds", "3", "--sequences", "fr1/desk", "--cluster")
+    arguments = ask(
+        data, out, "--presets", "default", "--seeds", "3", "--sequences", "fr1/desk", "--refine", "0", "--cluster"
+    )
     process = subprocess.Popen(
         [sys.executable, "-m", "tcgsplat.cli.main", *arguments], stderr=subprocess.PIPE, stdout=subprocess.PIPE
     )
@@ -295,7 +301,8 @@ def test_a_worker_that_is_killed_costs_one_run_which_is_tried_again(data: Path, 
     runs = results(out)
     assert [run["state"] for run in runs.values()] == ["done"] * 3
     for run in runs.values():
-        assert {"config.toml", "summary.json", "report.json"} <= {path.name for path in (out / run["place"]).iterdir()}
+        files = {path.name for path in (out / run["place"]).iterdir()}
+        assert {"config.toml", "summary.json", "report.json", "confidence.json"} <= files
     kept = stamps(out, "report.json")
     assert main(arguments) == 0, "what the cluster has done is not done again"
     assert stamps(out, "report.json") == kept
@@ -359,6 +366,50 @@ def test_differences_are_to_the_last_preset():
     table = rows(tables.differences(some, SYNTHETIC))
     assert table[2][:3] == ["`default`", "ATE RMSE [cm] ↓", "-0.500"]
     assert table[2][-2:] == ["2", "0"]
+
+
+def watched(ause: float, rival: float, fault: float | None = None) -> Watched:
+    removed = np.linspace(0, 0.99, 12)
+    pixels = np.random.default_rng(0).random(200)
+    return Watched(
+        7,
+        {OURS: {"ause": ause, "spearman": 0.5, "spearman_p10": None}} | {name: {"ause": rival} for name in RIVALS},
+        fault,
+        {name: Sparsification(removed, 1 - 0.9 * removed, 1 - removed, 1.0) for name in (OURS, *RIVALS)},
+        pixels,
+        0.1 * pixels,
+    )
+
+
+def test_confidence_by_hand(tmp_path: Path):
+    of = {("clean", 0): watched(0.2, 0.3), ("clean", 1): watched(0.4, 0.3), ("moving", 0): watched(0.1, 0.9, 0.8)}
+    some = [replace(outcome("default", name, seed, 1.0), watched=one) for (name, seed), one in of.items()]
+    some.append(replace(some[0], sequence="moving", seed=1, state="lost", watched=watched(9.9, 0.0)))
+    some.append(outcome("base", "clean", 0, 1.0))
+    text = tables.confidence(some, SYNTHETIC)
+    clean, moving = rows(text)[2:]
+    assert clean == ["clean", "`default`", "0.30 ± 0.14", *["0.30 ± 0.00"] * 2, "0.50 ± 0.00", *["–"] * 4]
+    assert moving[2:4] == ["0.10 (1 of 2 runs)", "0.90 (1 of 2 runs)"]
+    assert moving[-1] == "0.80 (1 of 2 runs)"
+    assert "lower with `default`, than opacity in 2 of 3 and than observations in 2 of 3 runs.\n" in text + "\n"
+    assert set(plots.figures(some, ["clean", "moving"], SYNTHETIC)) >= {"sparsification.svg", "reliability.svg"}
+    assert "reliability.svg" not in plots.figures(some[:2], ["clean", "moving"], SYNTHETIC), "no other to fit to"
+    assert tables.confidence([outcome("base", "clean", 0, 1.0)], SYNTHETIC) == ""
+
+
+def test_what_a_watched_run_showed_is_read_back(tmp_path: Path):
+    told, path = watched(0.2, 0.3, 0.8), tmp_path / "confidence.json"
+    told.write(path)
+    read = Watched.read(path)
+    assert read is not None
+    assert read.figures == told.figures
+    np.testing.assert_allclose(read.curves[OURS].error, told.curves[OURS].error, atol=1e-4)
+    np.testing.assert_allclose(read.error, told.error, rtol=1e-5)
+    path.write_text("{}")
+    assert Watched.read(path) is None
+    nothing = Watched.of(Predictions())
+    nothing.write(path)
+    assert Watched.read(path).frames == 0  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("suite", [SYNTHETIC, TUM, REPLICA, SCANNET], ids=lambda suite: suite.name)

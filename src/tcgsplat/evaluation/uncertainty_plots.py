@@ -100,7 +100,7 @@ def sparsification_plot(
     panel.fill_between(removed, band[0], band[1], color=_OURS, alpha=0.15, linewidth=0)
     panel.axhline(1.0, **random.style)
     panel.plot(removed, np.stack([curve.oracle / curve.random for curve in ours]).mean(axis=0), **oracle.style)
-    for line in reversed(lines):
+    for line in lines:  # the thick one below, so that one that coincides with it is seen
         panel.plot(removed, relative[line.name].mean(axis=0), **line.style)
     highest = max(curves.mean(axis=0).max() for curves in relative.values())
     panel.set(xlim=(0, 100), ylim=(0, float(np.clip(1.04 * highest, 1.1, _HIGHEST))))
@@ -150,7 +150,7 @@ def reliability_plot(
     cells = (np.geomspace if logarithmic else np.linspace)(least, most, _CELLS + 1)
     ideal = _Line("as expected", "", _GREY, (0, (5, 4)), 1.6)
     panel.plot((least, most), (least, most), **ideal.style)
-    for line in reversed(lines):
+    for line in lines:
         one = maps[line.name]
         expected, found = (np.maximum(scale * values, least) for values in (one.expected, one.found))
         panel.plot(expected, found, marker="o", markersize=8 if line is lines[0] else 5.5, clip_on=False, **line.style)

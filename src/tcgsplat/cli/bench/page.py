@@ -110,8 +110,18 @@ def confidence_section(results: Results, figures: Mapping[str, object]) -> str:
     parts = (
         "## Is confidence true",
         table,
-        _picture(figures, "sparsification.svg", "Depth error left over the share of the most doubtful pixels removed"),
-        _picture(figures, "reliability.svg", "Depth error found over depth error expected, by sequence"),
+        _picture(
+            figures,
+            "sparsification.svg",
+            "Depth error left when the most doubtful pixels are removed, mean over runs; the band is from the 10th to "
+            "the 90th percentile of the runs of the thick line, which the other measures are of too",
+        ),
+        _picture(
+            figures,
+            "reliability.svg",
+            "Depth error found over depth error expected, which is learnt from the other sequences; above the diagonal "
+            "the map is too sure",
+        ),
     )
     return "\n\n".join(part for part in parts if part)
 

@@ -38,7 +38,7 @@ MOST_LOST = 0.5
 WATCHED = "confidence.json"
 """In a run directory: what watching the run has shown of its confidence."""
 WATCHED_EVERY: Final = 10
-"""Frames: so few that watching takes about a tenth of a run's time."""
+"""Frames; predicting one and scoring that takes as long as three or four steps of SLAM."""
 RIVALS: Final = ("opacity", "observations", "previous residual", "depth edge")
 """Other measures of doubt, which cost little and confidence has to beat."""
 KEPT = (

@@ -148,8 +148,8 @@ def confidence(outcomes: Outcomes, suite: Suite) -> str:
         "tracking found, and doubt (1 - rendered confidence) is held against the true error of depth, pixel by pixel. "
         "**AUSE**: error left when the most doubtful pixels are removed first, as an area above that of an oracle, "
         "over the same for a random order: 0 is the oracle, 1 knows nothing; beside it that of two measures that are "
-        "to be had for less. **Spearman**: rank correlation of doubt and error, median over frames and 10th "
-        "percentile; **partial**: of what depth, opacity, observations and the slope of colour leave unexplained, "
+        "to be had for less. **Spearman**: rank correlation of doubt and error, median and 10th percentile over "
+        "frames; **partial**: of what depth, opacity, observations and the slope of colour leave unexplained, "
         "median. **AUROC bad**: chance that a pixel that is off by more than "
         f"{100 * BAD_METERS:g} cm and {100 * BAD_SHARE:g} % is more doubtful than another; **AUROC fault**: the same "
         "where the recording was wrong, as somebody was in the way, once the map has used the frame. Colour, and "
@@ -161,10 +161,10 @@ def confidence(outcomes: Outcomes, suite: Suite) -> str:
 
 OF_CONFIDENCE: Final[Mapping[str, Callable[[Watched], float | None]]] = {
     "AUSE ↓": lambda run: run.score("ause"),
-    "of opacity": lambda run: run.score("ause", "opacity"),
-    "of observations": lambda run: run.score("ause", "observations"),
+    "AUSE of opacity": lambda run: run.score("ause", "opacity"),
+    "AUSE of observations": lambda run: run.score("ause", "observations"),
     "Spearman ↑": lambda run: run.score("spearman"),
-    "10th percentile ↑": lambda run: run.score("spearman_p10"),
+    "Spearman p10 ↑": lambda run: run.score("spearman_p10"),
     "partial ↑": lambda run: run.score("partial_spearman"),
     "AUROC bad ↑": lambda run: run.score("auroc"),
     "AUROC fault ↑": lambda run: run.fault_auroc,
@@ -178,7 +178,7 @@ def _watched(one: Outcome, of: Callable[[Watched], float | None]) -> float | Non
 
 def _beaten(outcomes: Outcomes, suite: Suite) -> str:
     """In how many runs confidence has the lower AUSE."""
-    told = []
+    told, frames = [], 0
     for preset in suite.presets:
         done = [one.watched for one in outcomes if one.preset == preset and one.watched and one.state == "done"]
         counts = []
@@ -186,8 +186,12 @@ def _beaten(outcomes: Outcomes, suite: Suite) -> str:
             both = [(run.score("ause"), run.score("ause", measure)) for run in done]
             known = [(ours, other) for ours, other in both if ours is not None and other is not None]
             counts.append(f"than {measure} in {sum(ours < other for ours, other in known)} of {len(known)}")
-        told.append(f"with `{preset}`, {' and '.join(counts)} runs")
-    return f"The AUSE of confidence is lower {'; '.join(told)}."
+        if done:
+            frames += sum(run.frames for run in done)
+            told.append(f"with `{preset}`, {' and '.join(counts)} runs")
+    if not told:
+        return "None of these runs counts."
+    return f"{frames} frames were predicted. The AUSE of confidence is lower {'; '.join(told)}."
 
 
 def runtime(outcomes: Outcomes, suite: Suite) -> str:
