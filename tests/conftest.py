@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
+from pathlib import Path
 
 os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -16,7 +17,9 @@ shapes.check_from_now_on()
 from analytic_room import Room  # after the line above, or what it imports would go unchecked
 
 from tcgsplat.confidence.state import ConfidenceConfig
+from tcgsplat.datasets.synthetic import SynthConfig
 from tcgsplat.datasets.synthetic.studio import Studio, furnished_studio
+from tcgsplat.datasets.synthetic.synthesis import record
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.feedback import judged
 from tcgsplat.mapping.mapper import Mapper
@@ -75,3 +78,12 @@ def peopled(workers: Executor) -> Studio:
 def twin_rooms(workers: Executor) -> Studio:
     """Two rooms that look the same, and a hall between them."""
     return furnished_studio(64, 48, 0, moving_object=False, workers=workers, place="twins")
+
+
+@pytest.fixture(scope="session")
+def easy_walk(studio: Studio, workers: Executor, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The apartment recorded at an easy pace, 300 frames; not to be written to."""
+    folder = tmp_path_factory.mktemp("easy") / "walk"
+    folder.mkdir()
+    record(studio, folder, SynthConfig(frames=300, width=64, height=48, free_views=0), workers)
+    return folder

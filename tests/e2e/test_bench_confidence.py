@@ -1,20 +1,35 @@
-"""`tcgsplat bench confidence`, on two tiny walks."""
+"""`tcgsplat bench confidence`, on the beginnings of two tiny walks."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from tcgsplat.cli.main import main
+from tcgsplat.datasets.synthetic import SynthConfig
+from tcgsplat.datasets.synthetic.synthesis import record
+
+WALK = SynthConfig(frames=120, width=64, height=48, free_views=0)
+CROWD = replace(WALK, moving_object=True, depth_noise=True)
+USED = 40
+
+
+def cut(folder, frames):
+    """Forget all but the first frames of a recording."""
+    for name in ("rgb.txt", "depth.txt"):
+        lines = (folder / name).read_text().splitlines(keepends=True)
+        (folder / name).write_text("".join(lines[: frames + 1]))  # the first is a comment
 
 
 @pytest.mark.slow
-def test_the_page_has_what_was_measured(tmp_path, capsys, monkeypatch):
-    for name, flags in (("walk", []), ("crowd", ["--moving-object", "--depth-noise"])):
-        size = ["--frames", "120", "--width", "64", "--height", "48", "--free-views", "0"]
-        assert main(["synth", str(tmp_path / name), *size, *flags]) == 0
+def test_the_page_has_what_was_measured(tmp_path, capsys, studio, peopled, workers):
+    folders = [tmp_path / "walk", tmp_path / "crowd"]
+    for folder, place, config in zip(folders, (studio, peopled), (WALK, CROWD), strict=True):
+        folder.mkdir()
+        record(place, folder, config, workers)
+        cut(folder, USED)
     out = tmp_path / "page"
-    folders = [str(tmp_path / name) for name in ("walk", "crowd")]
-    assert main(["bench", "confidence", *folders, "--out", str(out), "--every", "6"]) == 0
+    assert main(["bench", "confidence", *map(str, folders), "--out", str(out), "--every", "4"]) == 0
     page = (out / "README.md").read_text()
     told = json.loads((out / "confidence.json").read_text())
     assert page in capsys.readouterr().out
@@ -31,8 +46,9 @@ def test_the_page_has_what_was_measured(tmp_path, capsys, monkeypatch):
     assert "| walk | expectation |" in page
 
 
-def test_says_that_the_truth_is_missing(tmp_path, capsys):
-    assert main(["synth", str(tmp_path / "walk"), "--frames", "2", "--width", "32", "--height", "24"]) == 0
+def test_says_that_the_truth_is_missing(tmp_path, capsys, studio, workers):
+    (tmp_path / "walk").mkdir()
+    record(studio, tmp_path / "walk", replace(WALK, frames=2), workers)
     (tmp_path / "walk" / "truth" / "events.json").unlink()
     (tmp_path / "walk" / "truth").rmdir()
     assert main(["bench", "confidence", str(tmp_path / "walk"), "--out", str(tmp_path / "page")]) == 1

@@ -505,7 +505,8 @@ def test_a_run_goes_to_runs_and_is_not_overwritten_by_accident(
 
 def test_synth_writes_a_sequence(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "apartment"
-    assert main(["synth", str(out), "--frames", "3", "--width", "64", "--height", "48", "--depth-noise"]) == 0
+    small = ["--frames", "3", "--width", "64", "--height", "48", "--free-views", "2"]
+    assert main(["synth", str(out), *small, "--depth-noise"]) == 0
     assert capsys.readouterr().out == f"3 frames, 64x48: {out}\n"
     sequence = open_sequence(out)
     assert len(list(sequence)) == len(sequence.ground_truth()) == 3

@@ -6,16 +6,14 @@ from pathlib import Path
 import pytest
 
 from tcgsplat.cli.main import main
-from tcgsplat.datasets.synthetic import SynthConfig, synthesize
 from tcgsplat.storage.run_directory import RunDirectory
 
 
-def test_every_fourth_frame_is_withheld(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    synthesize(tmp_path / "data", SynthConfig(frames=300, width=96, height=72))
-    part = ["--limit", "18"]  # of a walk at an easy pace
+def test_every_fourth_frame_is_withheld(easy_walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    part = ["--limit", "18"]
     submaps = ["--schedule.submap-by", "interval", "--schedule.submap-interval", "8", "--schedule.map-every", "2"]
     withheld = ["--schedule.withhold-every", "4"]
-    assert main(["run", str(tmp_path / "data"), *part, *submaps, *withheld, "--out", str(tmp_path / "run")]) == 0
+    assert main(["run", str(easy_walk), *part, *submaps, *withheld, "--out", str(tmp_path / "run")]) == 0
 
     rows = RunDirectory.open(tmp_path / "run").trajectory()[0].rows
     assert not any(row.lost for row in rows)
