@@ -30,9 +30,10 @@ def checked(thing: Any) -> Any:
             thing.__init__ = checked(thing.__init__)  # type: ignore[misc]
         return thing
     enforced = beartype(conf=LIKE_A_TYPE_CHECKER)(thing)
-    if not any(has_shape(hint) for hint in thing.__annotations__.values()):
+    hints = thing.__annotations__.values()
+    if not any(has_shape(hint) for hint in hints):
         return enforced
-    if "{" in str(thing.__annotations__):  # dimensions that are arguments: all of them must be looked at
+    if any("{" in str(hint) for hint in hints):  # dimensions that are arguments: all of them must be looked at
         return jaxtyped(enforced, typechecker=None)
 
     @functools.wraps(thing)
