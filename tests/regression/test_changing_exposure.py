@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from analytic_room import RoomSequence, errors, walk
 from tcgsplat.config import SlamConfig, with_settings
 from tcgsplat.datasets import Sequence, open_sequence
 from tcgsplat.datasets.synthetic import SynthConfig
-from tcgsplat.datasets.synthetic.studio import furnished_studio
+from tcgsplat.datasets.synthetic.studio import Studio
 from tcgsplat.datasets.synthetic.synthesis import record
 from tcgsplat.evaluation.report import evaluate
 from tcgsplat.mapping.schedule import ScheduleConfig
@@ -190,7 +190,7 @@ def test_changing_exposure_costs_little(name: str, walked: Callable[..., Run]) -
 
 # The synthetic apartment, whose pixels are rounded and clipped, and whose gains are told by exposure.txt.
 
-APARTMENT = SynthConfig(frames=300, width=64, height=48, exposure_jumps=True)
+APARTMENT = SynthConfig(frames=300, width=64, height=48, exposure_jumps=True, free_views=0)
 CONSTANT, JUMPING = slice(0, 42), slice(58, 148)
 """Frames of a gain of 1, and of four gains between 0.8 and 0.91 and six submaps."""
 
@@ -207,13 +207,13 @@ class Apartment:
 
 
 @pytest.fixture(scope="module")
-def apartment(tmp_path_factory: pytest.TempPathFactory, rasterizer: Rasterizer) -> Apartment:
+def apartment(
+    studio: Studio, workers: Executor, tmp_path_factory: pytest.TempPathFactory, rasterizer: Rasterizer
+) -> Apartment:
     root = tmp_path_factory.mktemp("apartment")
     data = root / "data"
     data.mkdir()
-    with ThreadPoolExecutor(2) as workers:
-        studio = furnished_studio(APARTMENT.width, APARTMENT.height, 0, moving_object=False, workers=workers)
-        record(studio, data, APARTMENT, workers)
+    record(studio, data, APARTMENT, workers)
     gain = np.loadtxt(data / "exposure.txt")[:, 1]
     assert (gain[CONSTANT] == 1).all()
     constant, jumping = (
