@@ -27,6 +27,7 @@ from tcgsplat.mapping.mapper import Grown, Mapper
 from tcgsplat.mapping.schedule import Schedule
 from tcgsplat.mapping.seeding import IdSource
 from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.render.view import Rendering, render_view
 from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
@@ -219,7 +220,7 @@ class Slam:
             clock.lap("wait")
             with self._core():
                 keyframe = Keyframe(self._synchronized(frame), T_map_cam, exposure.relaxed(EXPOSURE_LEAK))
-                grown = self._mapper.grown(keyframe, self.submap)
+                grown = self._mapper.grown(keyframe, self.submap, self._known(keyframe))
             self.submap, self._since_mapped = grown.submap, 0
             if not grown.first or not len(self.reference.submap):
                 self._refer_to(self.submap)
@@ -339,6 +340,14 @@ class Slam:
             whole = completed(sealed, self.config.mapper.seeding, self.config.confidence, self._rasterizer)
         self._store.keep(whole, checkpoint)
         return self._closer.closed(sealed.index, edge) if self.config.loop.enabled else Closure(sealed.index)
+
+    def _known(self, keyframe: Keyframe) -> Rendering | None:
+        """What the submap before shows of the view that a submap begins with: its own map shows nothing yet."""
+        before = self.reference
+        if self.submap.keyframes or not len(before.submap) or self.config.confidence.model == "paper":
+            return None
+        T_reference_cam = se3.inverse(before.T_map_reference) @ keyframe.T_map_cam
+        return render_view(before.submap, keyframe.frame.camera, T_reference_cam, self._rasterizer)
 
     def _updated(self, grown: Grown) -> tuple[Submap, MapUpdate]:
         """Optimise (equations 20 to 24), then judge what moved (equations 4 to 15); runs beside tracking."""

@@ -8,7 +8,7 @@ import torch
 from analytic_room import CAMERA, Room, RoomSequence, errors, pose, walk
 
 from tcgsplat.confidence.state import ConfidenceConfig
-from tcgsplat.config import SlamConfig
+from tcgsplat.config import SlamConfig, with_settings
 from tcgsplat.datasets.sequence import Sequence
 from tcgsplat.geometry import se3
 from tcgsplat.loop.settings import LoopConfig
@@ -146,6 +146,30 @@ class TestLag:
         fresh = tracker.track(frame, report.sealed, stale).T_map_cam
         torch.testing.assert_close(report.tracked.T_map_cam, fresh, atol=1e-9, rtol=0)
         assert not torch.allclose(fresh, stale, atol=1e-5)
+
+
+class TestHandedOn:
+    @pytest.mark.parametrize(("model", "doubted"), [("expectation", True), ("paper", False)])
+    def test_who_came_into_the_picture_as_a_submap_begins_is_doubted(
+        self, model: str, doubted: bool, walked: Run, rasterizer: Rasterizer
+    ) -> None:
+        """The submap itself shows nothing yet; the one before knows what is behind him."""
+        begins = next(report.frame_index for report in walked.reports if report.sealed)
+        slam = Slam(with_settings(CONFIG, {"confidence.model": model}), rasterizer)
+        for frame in SEQUENCE:
+            depth = frame.depth.clone()
+            if frame.index == begins:
+                depth[20:40, 30:50] -= 0.4
+            report = slam.step(replace(frame, depth=depth))
+            if frame.index == begins:
+                break
+        assert report.sealed is not None
+        pixels = CAMERA.project(slam.submap.gaussians.means)
+        him = ((pixels > torch.tensor([33, 23])) & (pixels < torch.tensor([47, 37]))).all(dim=-1)
+        far = ((pixels - torch.tensor([40, 30])).abs() > torch.tensor([15, 15])).any(dim=-1)
+        value = slam.submap.confidence.value
+        assert him.sum() > 100 and far.sum() > 1000
+        assert bool(value[him].median() < 0.5 * value[far].median()) == doubted
 
 
 class TestReference:

@@ -13,10 +13,11 @@ from tcgsplat.confidence import expectation
 from tcgsplat.confidence.state import ConfidenceConfig, ConfidenceState, Observation
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.mapping.mapper import Grown, Mapper, experienced
+from tcgsplat.mapping.mapper import Grown, Mapper, birth_error, experienced
 from tcgsplat.mapping.seeding import IdSource, SeedingConfig
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.render.view import Rendering, render_view
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.tensors import Plane, Pose
@@ -121,6 +122,18 @@ def test_confidence_at_no_error_at_the_reference_and_far_off() -> None:
     torch.testing.assert_close(p, torch.tensor([1.0, 0.55, 0.1]))
 
 
+@pytest.mark.parametrize("error", [0.0, 0.003, 0.02, 0.5])
+def test_the_error_that_makes_a_confidence(error: float) -> None:
+    p = expectation.confidence(torch.tensor([error]), error_ref=0.02, p_min=0.1)
+    found = expectation.expected_error(p.expand(2, 3), error_ref=0.02, p_min=0.1)
+    torch.testing.assert_close(found, torch.full((2, 3), error), atol=1e-6, rtol=1e-4)
+
+
+def test_any_error_makes_the_least_confidence() -> None:
+    p = torch.tensor([[0.1, 0.05, 1.0]])
+    assert expectation.expected_error(p, error_ref=0.02, p_min=0.1).tolist() == [[math.inf, math.inf, 0.0]]
+
+
 def columns(state: ConfidenceState) -> dict[str, Tensor]:
     return {field.name: getattr(state, field.name) for field in fields(state)}
 
@@ -207,16 +220,68 @@ def grown(
     T_map_cam: Pose,
     rasterizer: Rasterizer,
     config: ConfidenceConfig = DEFAULT,
+    known: Rendering | None = None,
 ) -> Grown:
     seeding = SeedingConfig(recipe="surface", spacing=1, footprint=0.5, flatness=0.2, opacity=0.9, push_back=0.0)
     settings = MapperConfig(seeding=seeding, first_iterations=20, depth_mode="planar", min_opacity=0.1, complete=False)
     mapper = Mapper(settings, config, rasterizer, IdSource(1_000_000), torch.Generator().manual_seed(0))
-    return mapper.grown(Keyframe(frame, T_map_cam), submap)
+    return mapper.grown(Keyframe(frame, T_map_cam), submap, known)
 
 
 def within(submap: Submap, T_map_cam: Pose, low: tuple[int, int], high: tuple[int, int]) -> Tensor:
     pixels = CAMERA.project(se3.transform(se3.inverse(T_map_cam), submap.gaussians.means))
     return ((pixels > torch.tensor(low)) & (pixels < torch.tensor(high))).all(dim=-1)
+
+
+def shown(depth: float, error: float, opacity: float = 1.0) -> Rendering:
+    """A map of one wall, by whose confidence it is off by so much."""
+    alpha = torch.full((CAMERA.height, CAMERA.width), opacity)
+    p = expectation.confidence(torch.tensor([error]), error_ref=CONFIG.error_ref, p_min=CONFIG.p_min)
+    surface = depth * alpha
+    return Rendering(torch.zeros(*alpha.shape, 3), surface, surface, alpha, p * alpha, torch.ones(0, dtype=torch.bool))
+
+
+def wall(depth: float) -> Frame:
+    frame = Room().frame()
+    return replace(frame, depth=torch.full_like(frame.depth, depth))
+
+
+class TestBirth:
+    """What is expected of a reading by a map that shows, or does not show, something there."""
+
+    OWN = 0.001 + 0.002 * 1.1**2  # at 1.5 m
+
+    def born(self, rendering: Rendering | None) -> float:
+        error = birth_error(wall(1.5), rendering, CONFIG)[5:-5, 5:-5]
+        assert (error - error.mean()).abs().max() < 1e-5
+        return float(error.mean())
+
+    @pytest.mark.parametrize("rendering", [None, shown(1.5, 0.3, opacity=0.4)])
+    def test_where_nothing_is_mapped_it_is_the_readings(self, rendering: Rendering | None) -> None:
+        assert self.born(rendering) == pytest.approx(self.OWN, abs=1e-5)
+
+    @pytest.mark.parametrize(
+        ("known", "expected"), [(0.0, OWN), (0.03, 0.015), (0.4, 0.2), (9.0, CONFIG.error_max / 2)]
+    )
+    @pytest.mark.parametrize("opacity", [0.7, 1.0])
+    def test_of_the_same_surface_the_map_is_believed_as_much_as_the_reading(
+        self, known: float, expected: float, opacity: float
+    ) -> None:
+        assert self.born(shown(1.5, known, opacity)) == pytest.approx(expected, rel=1e-3)
+
+    @pytest.mark.parametrize("known", [0.0, 0.03])
+    def test_before_a_surface_it_is_how_far(self, known: float) -> None:
+        assert self.born(shown(1.7, known)) == pytest.approx(0.2, rel=1e-3)
+        assert self.born(shown(4.0, known)) == CONFIG.error_max
+
+    @pytest.mark.parametrize("known", [0.0, 0.03, 0.15])
+    def test_what_comes_into_sight_behind_a_surface_has_nothing_of_it(self, known: float) -> None:
+        """Somebody has gone, of whom the map was in doubt or not: what he hid is not to blame."""
+        assert self.born(shown(1.3, known)) == pytest.approx(self.OWN, abs=1e-5)
+
+    def test_within_the_doubt_of_the_map_it_is_the_same_surface(self) -> None:
+        assert self.born(shown(1.4, 0.15)) == pytest.approx((0.15 + 0.1) / 2, rel=1e-3)
+        assert self.born(shown(1.6, 0.15)) == pytest.approx((0.15 + 0.1) / 2, rel=1e-3)
 
 
 class TestFrames:
@@ -235,6 +300,27 @@ class TestFrames:
         assert state.expected_error[away].median() < 0.01
         assert state.value[beside].median() < 0.6 < 0.85 < state.value[away].median()
         assert (state.evidence == DEFAULT.error_prior).all()
+
+    def test_a_new_submap_takes_over_what_the_one_before_knew(self, corner: Submap, rasterizer: Rasterizer) -> None:
+        """Somebody stands before a wall that the submap before shows, and a part of that is doubtful."""
+        frame, left = Room().frame(), within(corner, se3.identity(), (0, 0), (30, 60))
+        somebody = torch.zeros_like(frame.valid)
+        somebody[15:45, 45:65] = True
+        depth = torch.where(somebody, 0.6 * frame.depth, frame.depth)
+        value = torch.where(left, expectation.confidence(torch.tensor([0.05]), error_ref=0.1, p_min=0.1), 1.0)
+        known = render_view(
+            replace(corner, confidence=replace(corner.confidence, value=value)), CAMERA, se3.identity(), rasterizer
+        )
+        begun = Submap.anchored(se3.identity(), 1)
+        states = [
+            grown(begun, replace(frame, depth=depth), se3.identity(), rasterizer, DEFAULT, before).submap
+            for before in (None, known)
+        ]
+        errors = [state.confidence.expected_error for state in states]
+        person, wall = (within(states[0], se3.identity(), *box) for box in (((48, 18), (62, 42)), ((5, 5), (25, 55))))
+        assert torch.equal(states[0].gaussians.means, states[1].gaussians.means)
+        assert errors[0][person].median() < 0.01 and errors[1][person].min() > 0.2
+        assert errors[0][wall].median() < 0.01 and abs(errors[1][wall].median() - 0.025) < 0.003
 
     def test_an_empty_map_has_nothing_to_learn(self, rasterizer: Rasterizer) -> None:
         born = grown(Submap.anchored(se3.identity(), 0), Room().frame(), se3.identity(), rasterizer)

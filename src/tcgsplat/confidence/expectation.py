@@ -83,3 +83,15 @@ def confidence(expected: PerGaussian, *, error_ref: float, p_min: float) -> PerG
         p_min: Floor of every confidence.
     """
     return p_min + (1.0 - p_min) / (1.0 + expected / error_ref)
+
+
+def expected_error(confidence: Plane, *, error_ref: float, p_min: float) -> Plane:
+    r"""The error that makes a confidence, metres; the inverse of `confidence`, infinite at the floor and below.
+
+    Args:
+        confidence: p, of a Gaussian or of a pixel.
+        error_ref: $e_{ref}$, metres.
+        p_min: Floor of every confidence.
+    """
+    share = (confidence - p_min).clamp_min(0.0) / (1.0 - p_min)
+    return (error_ref * (1.0 / share - 1.0)).clamp_min(0.0)

@@ -5,6 +5,7 @@ offline, by a finished map, of a frame that was kept back. It holds several meas
 and those that are to be had for less, which it must beat to be worth anything.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from tcgsplat.confidence.expectation import noise, reading_error
 from tcgsplat.confidence.state import ConfidenceConfig
-from tcgsplat.evaluation.uncertainty import Ordered, Scores, Sparsification, Values, sparsification
+from tcgsplat.evaluation.uncertainty import Ordered, Scores, Sparsification, Values, auroc, sparsification
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.protocol import Rasterizer
@@ -141,9 +142,42 @@ def of_depth(claimed: Claim, true_depth: Plane, valid: Mask, rng: np.random.Gene
     """Held against the true depth, metres, of the pixels that the map covers; 0 where the truth is not known."""
     depth = claimed.rendering.depth
     compared = valid & (true_depth > 0) & (depth > 0)
-    error = (depth - true_depth).abs()
-    bad = error > torch.clamp_min(BAD_SHARE * true_depth, BAD_METERS)
-    return _judged(claimed, error, bad, compared, rng, sampled)
+    return _judged(claimed, (depth - true_depth).abs(), _bad_depth(depth, true_depth), compared, rng, sampled)
+
+
+def _bad_depth(depth: Plane, true_depth: Plane) -> Mask:
+    return (depth - true_depth).abs() > torch.clamp_min(BAD_SHARE * true_depth, BAD_METERS)
+
+
+@dataclass(frozen=True)
+class FaultTold:
+    """How well doubt tells a known fault: areas under the curve, NaN where there is nothing to tell apart."""
+
+    in_picture: float
+    """The pixels of the fault from all others, whatever the map shows there."""
+    in_map: float
+    """Those of the fault at which the map is wrong from all at which it is right. A map that shows what stands behind
+    a passer-by is right to be sure of it, and one that still shows him where he was is right to doubt it."""
+
+
+def of_fault(rendering: Rendering, true_depth: Plane, fault: Mask) -> FaultTold:
+    """Held against a known fault, over the pixels that the map covers.
+
+    Args:
+        rendering: Of a map that has used the frame.
+        true_depth: Of what stands still, metres; 0 where it is not known.
+        fault: Where the frame was wrong.
+    """
+    depth = rendering.depth
+    doubt = 1.0 - rendering.confidence / rendering.alpha.clamp_min(1e-3)
+    wrong = _bad_depth(depth, true_depth)
+    mapped = depth > 0
+    compared = mapped & (true_depth > 0) & (fault | ~wrong)
+    return FaultTold(_told(doubt, fault, mapped), _told(doubt, fault & wrong, compared))
+
+
+def _told(doubt: Plane, flags: Mask, among: Mask) -> float:
+    return auroc(doubt[among].numpy().astype(np.float64), flags[among].numpy()) if bool(among.any()) else math.nan
 
 
 def of_color(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from tcgsplat.confidence import equations as eq
-from tcgsplat.confidence.expectation import reading_error
+from tcgsplat.confidence.expectation import expected_error, reading_error
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.keyframes import thinned
@@ -14,7 +14,7 @@ from tcgsplat.mapping.optimization import Optimization, begin
 from tcgsplat.mapping.seeding import IdSource, seed
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.render.view import Rendering, blended, render_view
+from tcgsplat.render.view import MIN_COVERAGE, Rendering, blended, render_view
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
@@ -79,15 +79,21 @@ class Mapper:
         self._ids = ids
         self._generator = generator
 
-    def grown(self, keyframe: Keyframe, submap: Submap) -> Grown:
-        """The submap with a new keyframe taken in."""
+    def grown(self, keyframe: Keyframe, submap: Submap, known: Rendering | None = None) -> Grown:
+        """The submap with a new keyframe taken in.
+
+        Args:
+            keyframe: The new one.
+            submap: The active one.
+            known: What the submap before shows of a submap's first view.
+        """
         first, frame, T_map_cam = not submap.keyframes, keyframe.balanced, keyframe.T_map_cam
         rendering = None if first else render_view(submap, frame.camera, T_map_cam, self._rasterizer)
         seeds = seed(frame, T_map_cam, rendering, submap.gaussians, self._ids, self._generator, self._config.seeding)
         doubt = None
         if self._confidence.model != "paper":
             pixels = frame.camera.project(se3.transform(se3.inverse(T_map_cam), seeds.means))
-            doubt = eq.sample_at(self.birth_error(frame, rendering), pixels)
+            doubt = eq.sample_at(self.birth_error(frame, known if first else rendering), pixels)
         keyframes = thinned((*submap.keyframes, keyframe), self._config.max_keyframes)
         grown = replace(submap.grown(seeds, self._confidence, doubt), keyframes=keyframes)
         return Grown(grown, len(seeds), first, submap, rendering)
@@ -131,20 +137,26 @@ class Mapper:
 def birth_error(frame: Frame, rendering: Rendering | None, config: ConfidenceConfig) -> Plane:
     """The depth error to expect of what is made of each reading, metres.
 
-    It is that of the reading; and where the map shows a surface behind it, as far behind as that: either of them is
-    wrong, or something has come into the picture and may go again.
+    It is that of the reading. Where the map shows a surface behind it, it is as far behind as that: either of them is
+    wrong, or something has come into the picture and may go again. Where the map shows the same surface, as far as
+    anybody can tell, what the map expects of it and what is found now count alike.
 
     Args:
         frame: That is taken into the map.
-        rendering: Its view of the map before; None of an empty one.
+        rendering: Its view of the map before, or of the submap before if it begins one; None of an empty one.
         config: Of the sensor's noise.
     """
     largest = config.error_max
     own = reading_error(frame.depth, noise_floor=config.noise_floor, noise_slope=config.noise_slope, largest=largest)
     if rendering is None:
         return own
-    behind = torch.where((rendering.depth > 0) & (frame.depth > 0), rendering.depth - frame.depth, 0.0)
-    return torch.maximum(own, behind).clamp_max(largest)
+    shown = (rendering.depth > 0) & (frame.depth > 0)
+    behind = torch.where(shown, rendering.depth - frame.depth, 0.0)
+    trust = rendering.confidence / rendering.alpha.clamp_min(MIN_COVERAGE)
+    known = expected_error(trust, error_ref=config.error_ref, p_min=config.p_min).clamp_max(largest)
+    same = shown & (behind.abs() <= torch.maximum(own, known))
+    handed_on = torch.where(same, (known + behind.abs()) / 2, behind)
+    return torch.maximum(own, handed_on).clamp_max(largest)
 
 
 def disagreement(frame: Frame, rendering: Rendering) -> Plane:
