@@ -155,6 +155,7 @@ _PUBLISHED: tuple[tuple[str, _Three, Origin, str], ...] = (
     ("confidence.stability_reduction", _same("mean"), "paper", "equation 23 to the letter; next to inert"),
     ("confidence.tracking_floor", _same(0.2), "paper", "Section 4.1"),
     ("confidence.view_floor", _same(0.5), "ours", "changes scores by at most a quarter, about their spread"),
+    ("confidence.doubt_weight", _same(1.0), "paper", "equation 20: what is doubted weighs twice as much in mapping"),
     ("confidence.step_scale_min", _same(0.8), "paper", "Section 4.1"),
     ("confidence.step_scale_max", _same(1.2), "paper", "Section 4.1"),
     ("confidence.step_scale_mode", _same("gradient"), "paper", "equation 24 to the letter; Adam cancels it"),

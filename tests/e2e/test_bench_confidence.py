@@ -44,6 +44,12 @@ def test_the_page_has_what_was_measured(tmp_path, capsys, studio, peopled, worke
     assert ours["confidence"]["ause"] < 0.8
     assert set(told["calibration"]) == {"walk", "crowd"}
     assert "| walk | expectation |" in page
+    walk, _, crowd, _ = told["arms"]
+    assert walk["crossing"] is None and walk["fault_auroc"] is None
+    assert crowd["crossing"]["places"] > 100
+    assert crowd["fault_auroc_in_map"] > 0.8 and "| crowd | expectation |" in page.split("## Somebody walks about")[1]
+    events = {event["name"]: event["of"] for event in crowd["events"]}
+    assert events == {"moving object": "picture", "absence": "region"}
 
 
 def test_says_that_the_truth_is_missing(tmp_path, capsys, studio, workers):

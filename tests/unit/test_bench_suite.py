@@ -376,6 +376,7 @@ def watched(ause: float, rival: float, fault: float | None = None) -> Watched:
         7,
         {OURS: {"ause": ause, "spearman": 0.5, "spearman_p10": None}} | {name: {"ause": rival} for name in RIVALS},
         fault,
+        fault,
         {name: Sparsification(removed, 1 - 0.9 * removed, 1 - removed, 1.0) for name in (OURS, *RIVALS)},
         pixels,
         0.1 * pixels,
@@ -389,9 +390,9 @@ def test_confidence_by_hand(tmp_path: Path):
     some.append(outcome("base", "clean", 0, 1.0))
     text = tables.confidence(some, SYNTHETIC)
     clean, moving = rows(text)[2:]
-    assert clean == ["clean", "`default`", "0.30 ± 0.14", *["0.30 ± 0.00"] * 2, "0.50 ± 0.00", *["–"] * 4]
+    assert clean == ["clean", "`default`", "0.30 ± 0.14", *["0.30 ± 0.00"] * 2, "0.50 ± 0.00", *["–"] * 5]
     assert moving[2:4] == ["0.10 (1 of 2 runs)", "0.90 (1 of 2 runs)"]
-    assert moving[-1] == "0.80 (1 of 2 runs)"
+    assert moving[-2:] == ["0.80 (1 of 2 runs)"] * 2
     assert "lower with `default`, than opacity in 2 of 3 and than observations in 2 of 3 runs.\n" in text + "\n"
     assert set(plots.figures(some, ["clean", "moving"], SYNTHETIC)) >= {"sparsification.svg", "reliability.svg"}
     assert "reliability.svg" not in plots.figures(some[:2], ["clean", "moving"], SYNTHETIC), "no other to fit to"

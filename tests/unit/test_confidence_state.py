@@ -37,7 +37,7 @@ def close(actual: Tensor, *expected: float) -> None:
 
 def test_defaults_are_the_papers_where_the_paper_states_them() -> None:
     config = ConfidenceConfig()
-    assert (config.tracking_floor, config.step_scale_min, config.step_scale_max) == (0.2, 0.8, 1.2)
+    assert config.tracking_floor == 0.2
     assert config.stability_weight == 0.01
     assert config.guide_mapping
     assert config.guide_tracking
@@ -71,11 +71,12 @@ def test_no_decay_is_a_valid_setting() -> None:
         ("slack_min", -1.0, "at least 0 and finite"),
         ("slack_max", 0.001, "at least slack_min (0.002) and finite"),
         ("step_scale_min", -0.1, "at least 0 and finite"),
-        ("step_scale_max", 0.5, "at least step_scale_min (0.8) and finite"),
+        ("step_scale_max", 0.5, "at least step_scale_min (1) and finite"),
         ("update_rate", 0.0, "above 0 and at most 1"),
         ("baseline_rate", 1.5, "above 0 and at most 1"),
         ("tracking_floor", 0.0, "above 0 and at most 1"),
         ("view_floor", 1.1, "between 0 and 1"),
+        ("doubt_weight", -1.0, "above -1 and finite"),
         ("stability_reduction", "max", '"mean" or "sum"'),
         ("step_scale_mode", "adam", '"step" or "gradient"'),
         ("model", "base", '"expectation" or "paper" or "constant" or "shuffled"'),

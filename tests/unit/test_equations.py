@@ -146,6 +146,7 @@ def test_eq17_composites_from_front_to_back() -> None:
 def test_eqs18_and_20_by_hand() -> None:
     is_close(eq.tracking_weight(row(0.0, 0.5, 1.0)[None], floor=0.2), 0.2, 0.6, 1.0)
     is_close(eq.mapping_weight(row(0.0, 0.5, 1.0)[None]), 2.0, 1.5, 1.0)
+    is_close(eq.mapping_weight(row(0.0, 0.5, 1.0)[None], doubt=-0.8), 0.2, 0.6, 1.0)
 
 
 def test_eq19_by_hand() -> None:

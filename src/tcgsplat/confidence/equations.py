@@ -296,18 +296,19 @@ def tracking_loss(
     return (weight * (color_weight * color_residual + depth_weight * depth_residual)).sum()
 
 
-def mapping_weight(confidence_map: Plane) -> Plane:
-    r"""Weight of a pixel when the map is optimised: effort goes where the map is not yet reliable.
+def mapping_weight(confidence_map: Plane, *, doubt: float = 1.0) -> Plane:
+    r"""Let mapping work more, or less, where the map is doubted.
 
-    $W_{map}(u) = 1 + (1 - P(u))$  (Eq. 20)
+    $W_{map}(u) = 1 + k (1 - P(u))$  (Eq. 20)
 
     Args:
         confidence_map: $P$ of equation 17, detached.
+        doubt: $k > -1$: how much more what is wholly doubted weighs; the paper has no k, which is to say 1.
 
     Returns:
-        Weights in [1, 2]; 2 where there is no map.
+        Weights between 1 and 1 + k; 1 + k where there is no map.
     """
-    return 1.0 + (1.0 - confidence_map)
+    return 1.0 + doubt * (1.0 - confidence_map)
 
 
 def mapping_loss(

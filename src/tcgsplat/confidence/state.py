@@ -98,10 +98,14 @@ class ConfidenceConfig:
     """w_min, unitless, in (0, 1] [paper]."""
     view_floor: float = 0.5
     """w_min of loop closure, unitless, in [0, 1] [ours]: changes scores by at most a quarter, about their spread."""
-    step_scale_min: float = 0.8
-    """g_min, unitless [paper]."""
-    step_scale_max: float = 1.2
-    """g_max, unitless [paper]."""
+    doubt_weight: float = -0.8
+    """k of equation 20, unitless, above -1 [ours]: what is doubted weighs as little in mapping as in tracking at w_min
+    0.2, since to doubt is not to trust here, and not to want more views; the paper's is 1."""
+    step_scale_min: float = 1.0
+    """g_min, unitless [ours]: what is trusted moves as it would without confidence; at the paper's 0.8 the few steps of
+    an update do not reach as far, which costs 0.1 dB."""
+    step_scale_max: float = 1.4
+    """g_max, unitless [ours]: 0.4 above g_min, as the paper's 1.2."""
     step_scale_mode: Literal["step", "gradient"] = "step"
     """What equation 24 multiplies [ours]: "gradient" is the paper's text, and Adam cancels it; "step" is what Adam
     makes of the gradient."""
@@ -137,6 +141,7 @@ class ConfidenceConfig:
             self._require(name, 0 <= getattr(self, name) < math.inf, "at least 0 and finite")
         for name in ("update_rate", "baseline_rate", "tracking_floor", "error_memory"):
             self._require(name, 0 < getattr(self, name) <= 1, "above 0 and at most 1")
+        self._require("doubt_weight", -1 < self.doubt_weight < math.inf, "above -1 and finite")
         self._require("view_floor", 0 <= self.view_floor <= 1, "between 0 and 1")
         for name in ("slack", "step_scale"):
             low = getattr(self, f"{name}_min")

@@ -26,9 +26,9 @@ ROWS = 8
 ACROSS, DOWN, ACROSS_BACK, DOWN_BACK = range(4)
 PHASES = 4
 
-COLOR_WEIGHT, DEPTH_WEIGHT, GUIDED, DEPTH_CHANNEL, DIVIDED, SSIM_SLOPE, C1, C2 = range(8)
+COLOR_WEIGHT, DEPTH_WEIGHT, DOUBT, DEPTH_CHANNEL, DIVIDED, SSIM_SLOPE, C1, C2 = range(8)
 CONSTANTS = 8
-"""Weights of colour and of depth a pixel; 1 if confidence guides; the plane of depth, and 1 if it is divided by
+"""Weights of colour and of depth a pixel; k of Eq. 20, 0 if confidence guides nothing; the plane of depth, and 1 if it is divided by
 alpha; the derivative of the loss by one pixel's S; SSIM's two constants."""
 
 _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
@@ -142,7 +142,7 @@ def _pixels(
         pixel = y * width + x
         alpha, reading, seen = load(planes, 6 * plane + pixel), load(depth, pixel), load(valid, pixel)
         measured = where_ge(zero, reading, zero, seen)
-        weight = measured * fma(spread(constants[GUIDED]), one - load(planes, 3 * plane + pixel), one)
+        weight = measured * fma(spread(constants[DOUBT]), one - load(planes, 3 * plane + pixel), one)
         by_color, error = weight * (constants[COLOR_WEIGHT] * _THIRD), zero
         for c in range(3):
             at = c * plane + pixel

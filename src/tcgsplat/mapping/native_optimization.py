@@ -151,7 +151,8 @@ class NativeOptimization:
         constants = np.array(
             [
                 config.color_weight / view.measured, config.depth_weight / view.measured,
-                self._confidence.guide_mapping, 5 if config.depth_mode == "planar" else 4,
+                self._confidence.doubt_weight if self._confidence.guide_mapping else 0.0,
+                5 if config.depth_mode == "planar" else 4,
                 config.depth_mode != "composited", -config.ssim_weight / (3 * height * width), SSIM_C1, SSIM_C2,
             ],
             np.float32,

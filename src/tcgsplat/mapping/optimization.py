@@ -117,7 +117,7 @@ class AutogradOptimization:
         config, guided = self._config, self._confidence.guide_mapping
         measured = frame.valid & (frame.depth > 0)
         pixels = max(int(measured.sum()), 1)
-        weight = eq.mapping_weight(rendering.confidence) if guided else torch.ones_like(rendering.alpha)
+        weight = eq.mapping_weight(rendering.confidence, doubt=self._confidence.doubt_weight if guided else 0.0)
         # Where the picture saw nothing, the rendering is compared with itself, so that no window sees a false edge.
         seen = torch.where(frame.valid[..., None], rendering.color, frame.color)
         return eq.mapping_loss(

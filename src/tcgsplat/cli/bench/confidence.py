@@ -23,8 +23,9 @@ from tcgsplat.config import SlamConfig, to_toml, with_settings
 from tcgsplat.datasets.truth import Event, Truth
 from tcgsplat.errors import EvaluationError
 from tcgsplat.evaluation import ate
+from tcgsplat.evaluation.crossing import crossing
 from tcgsplat.evaluation.prediction import OURS, Judged, claim, of_depth
-from tcgsplat.evaluation.reaction import reaction
+from tcgsplat.evaluation.reaction import Series, reaction
 from tcgsplat.evaluation.uncertainty import Reliability, Sparsification
 from tcgsplat.evaluation.uncertainty_plots import reliability_plot, sparsification_plot, write
 from tcgsplat.render.backends import open_rasterizer
@@ -55,8 +56,13 @@ class Arm:
     """As `depth`, of frames that were never mapped, in the finished submaps."""
     fault_auroc: float | None
     """Of doubt, in telling the pixels of a known fault."""
+    fault_auroc_in_map: float | None
+    """The same where the map is wrong for it, from all places where it is right."""
+    crossing: Mapping[str, float | None] | None
+    """What became of the places that somebody hid who walked about, as `Crossing` has it."""
     events: Sequence[Mapping[str, object]]
-    """Of the sequence, with what confidence did: `before`, `lowest`, `time_to_drop`, `time_to_recover`, `change`."""
+    """Of the sequence, with what confidence did: `before`, `lowest`, `time_to_drop`, `time_to_recover`, `change`, and
+    `back`: just after it."""
 
 
 def command(args: Confidence, settings: Mapping[str, str]) -> int:
@@ -129,24 +135,43 @@ def performed(folder: Path, config: SlamConfig, rasterizer: Rasterizer, every: i
         summary(found.depth),
         summary(found.color),
         summary(kept_back),
-        found.mean_fault_auroc,
+        found.fault_auroc,
+        found.fault_auroc_in_map,
+        _crossed(found, config.confidence.p_min),
         [_told(event, found, len(truth.numbers)) for event in truth.events],
     )
     return arm, found
 
 
-def _told(event: Event, found: Predictions, frames: int) -> dict[str, object]:
-    """What confidence did about an event: its mean over what is mapped of the picture."""
+def _crossed(found: Predictions, floor: float) -> dict[str, float | None] | None:
+    if not found.looks:
+        return None
+    told = asdict(crossing(found.looks, floor))
+    return {name: None if _is_nan(value) else value for name, value in told.items()}
+
+
+def _series(event: Event, found: Predictions, frames: int) -> Series:
+    """Confidence over the frames: its mean over the event's region if it has one, else over the picture."""
     values = np.full(frames, np.nan)
-    for index, mean in found.mean.items():
+    for index, mean in (found.regional.get(event, {}) if event.region else found.mean).items():
         values[index] = mean
+    return values
+
+
+def _told(event: Event, found: Predictions, frames: int) -> dict[str, object]:
+    """What confidence did about an event."""
+    values = _series(event, found, frames)
     told: dict[str, object] = {"name": event.name, "first": event.first, "last": event.last}
-    during = values[event.first : event.last + 1]
-    known = during[np.isfinite(during)]
-    if len(known) > 1:
-        told["change"] = float(np.mean(known[-3:]) - np.mean(known[:3]))
-    if event.first > 0 and event.last + 1 < frames:
-        what = reaction(values, event.first, event.last + 1)
+    told["of"] = "region" if event.region else "picture"
+    during, after = (
+        part[np.isfinite(part)] for part in (values[event.first : event.last + 1], values[event.last + 1 :])
+    )
+    if len(during) > 1:
+        told["change"] = float(np.mean(during[-3:]) - np.mean(during[:3]))
+    if len(after):
+        told["back"] = float(np.mean(after[:3]))
+    if event.first > 0:
+        what = reaction(values, event.first, event.last + 1 if event.last + 1 < frames else None)
         told |= {name: value for name, value in asdict(what).items() if not _is_nan(value)}
     return told
 
@@ -184,13 +209,18 @@ def written(arms: Sequence[Arm], calibration: Mapping[str, float], about: str) -
         "oracle, 1 knows nothing. Means over frames; of Spearman's correlation the median and the tenth percentile.",
         "## The two models, depth, predicted before seen\n",
         markdown(
-            ("sequence", "model", "AUSE", "Spearman", "p10", "partial", "AUROC bad", "AUROC fault", "ATE cm"),
+            ("sequence", "model", "AUSE", "Spearman", "p10", "partial", "AUROC bad", "AUROC fault", "in map", "ATE cm"),
             [
-                (arm.sequence, arm.model, *_cells(arm.depth.get(OURS, {})), _n(arm.fault_auroc, 2), _n(arm.ate_rmse_cm))
+                (
+                    *(arm.sequence, arm.model, *_cells(arm.depth.get(OURS, {}))),
+                    *(_n(arm.fault_auroc, 2), _n(arm.fault_auroc_in_map, 2), _n(arm.ate_rmse_cm)),
+                )
                 for arm in arms
             ],
             left=2,
         ),
+        "AUROC bad: of pixels off by more than 2 cm and 5 %. AUROC fault: of those where the recording was wrong, once "
+        "the map has used the frame; in map: of those of them where the map is wrong too, from all where it is right.",
         "## The same of frames that were never mapped, in the finished map\n",
         markdown(
             ("sequence", "model", "AUSE", "Spearman", "p10", "partial", "AUROC bad"),
@@ -224,8 +254,29 @@ def written(arms: Sequence[Arm], calibration: Mapping[str, float], about: str) -
         for event in arm.events
     ]
     if events:
-        head = ("sequence", "model", "event", "frames", "before", "lowest", "drops after", "back after", "change")
-        parts += ["## What happens, and what confidence does: mean over the picture\n", markdown(head, events, left=2)]
+        levels = ("of", "before", "lowest", "drops after", "back after", "change", "just after")
+        head = ("sequence", "model", "event", "frames", *levels)
+        parts += ["## What happens, and what confidence does: mean over a region or the picture\n"]
+        parts += [markdown(head, events, left=2)]
+    crossed = [(arm.sequence, arm.model, *_passed(arm.crossing)) for arm in arms if arm.crossing]
+    if crossed:
+        parts += [
+            "## Somebody walks about: the places that he hides, 5 cm apart; time out of the picture does not count\n",
+            markdown(
+                (
+                    "sequence",
+                    "model",
+                    "hidden",
+                    "dropped",
+                    "after frames",
+                    "of these left",
+                    "recovered",
+                    "after frames",
+                ),
+                crossed,
+                left=2,
+            ),
+        ]
     return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
 
 
@@ -236,7 +287,24 @@ def _cells(scores: Mapping[str, float | None]) -> tuple[str, ...]:
 def _reacted(event: Mapping[str, object]) -> tuple[str, ...]:
     levels = (_n(event.get(name), 2) for name in ("before", "lowest"))
     times = ("-" if event.get(name) is None else str(event[name]) for name in ("time_to_drop", "time_to_recover"))
-    return (*levels, *times, _n(event.get("change"), 3))
+    return (str(event["of"]), *levels, *times, _n(event.get("change"), 3), _n(event.get("back"), 2))
+
+
+def _passed(told: Mapping[str, float | None]) -> tuple[str, ...]:
+    """The cells of a `Crossing`."""
+    shares = []
+    for count, of in (("dropped", "places"), ("recovered", "left")):
+        share, time = (
+            _share(told[count], told[of]),
+            _n(told["time_to_drop" if count == "dropped" else "time_to_recover"], 0),
+        )
+        shares.append((share, time))
+    (dropped, drop), (recovered, recover) = shares
+    return (f"{told['places']}", dropped, drop, f"{told['left']}", recovered, recover)
+
+
+def _share(count: float | None, of: float | None) -> str:
+    return f"{100 * count / of:.0f} %" if count is not None and of else "-"
 
 
 def _n(value: object, decimals: int = 3) -> str:

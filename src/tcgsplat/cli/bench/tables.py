@@ -152,7 +152,8 @@ def confidence(outcomes: Outcomes, suite: Suite) -> str:
         "frames; **partial**: of what depth, opacity, observations and the slope of colour leave unexplained, "
         "median. **AUROC bad**: chance that a pixel that is off by more than "
         f"{100 * BAD_METERS:g} cm and {100 * BAD_SHARE:g} % is more doubtful than another; **AUROC fault**: the same "
-        "where the recording was wrong, as somebody was in the way, once the map has used the frame. Colour, and "
+        "where the recording was wrong, as somebody was in the way, once the map has used the frame; **in map**: of "
+        "those places where the map is wrong for it, from all where it is right. Colour, and "
         "frames that are never mapped, are not part of this: see `tcgsplat bench confidence`."
     )
     table = markdown(("sequence", "preset", *OF_CONFIDENCE), rows, left=2)
@@ -168,6 +169,7 @@ OF_CONFIDENCE: Final[Mapping[str, Callable[[Watched], float | None]]] = {
     "partial ↑": lambda run: run.score("partial_spearman"),
     "AUROC bad ↑": lambda run: run.score("auroc"),
     "AUROC fault ↑": lambda run: run.fault_auroc,
+    "in map ↑": lambda run: run.fault_auroc_in_map,
 }
 
 

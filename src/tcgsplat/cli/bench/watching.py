@@ -9,26 +9,20 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import torch
 
 from tcgsplat.config import SlamConfig
-from tcgsplat.datasets.truth import Truth
-from tcgsplat.evaluation.prediction import OURS, Judged, Seen, claim, of_color, of_depth, seen
-from tcgsplat.evaluation.uncertainty import (
-    Reliability,
-    Scores,
-    Sparsification,
-    Values,
-    auroc,
-    calibrated,
-    reliability,
-)
+from tcgsplat.datasets.truth import Event, Truth
+from tcgsplat.evaluation.crossing import Look
+from tcgsplat.evaluation.prediction import OURS, FaultTold, Judged, Seen, claim, of_color, of_depth, of_fault, seen
+from tcgsplat.evaluation.uncertainty import Reliability, Scores, Sparsification, Values, calibrated, reliability
 from tcgsplat.geometry import se3
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.render.view import render_view
+from tcgsplat.render.view import Rendering, render_view
 from tcgsplat.scene.frame import Frame
 from tcgsplat.slam import Reference, StepReport
 from tcgsplat.storage import atomic
-from tcgsplat.tensors import Mask, Pose
+from tcgsplat.tensors import Mask, Plane, Pose
 
 ENOUGH: Final = 50
 """Pixels that a fault must have in a picture to be looked for."""
@@ -47,15 +41,28 @@ class Predictions:
     depth: list[Judged] = field(default_factory=list)
     color: list[Judged] = field(default_factory=list)
     mean: dict[int, float] = field(default_factory=dict)
-    """Rendered confidence over opacity, by frame index: mean over what is mapped."""
-    fault_auroc: list[float] = field(default_factory=list)
-    """Of doubt, in telling the pixels of a known fault from all others, once the frame has been used."""
+    """Rendered confidence over opacity, by frame index: mean over what is mapped, once the frame has been used."""
+    regional: dict[Event, dict[int, float]] = field(default_factory=dict)
+    """The same over the region that an event is about."""
+    faults: list[FaultTold] = field(default_factory=list)
+    """How well doubt tells a known fault, once the frame has been used."""
+    looks: list[Look] = field(default_factory=list)
+    """Where somebody walks about."""
 
     @property
-    def mean_fault_auroc(self) -> float | None:
-        """Over the frames; None where no fault is known."""
-        finite = [value for value in self.fault_auroc if math.isfinite(value)]
-        return statistics.fmean(finite) if finite else None
+    def fault_auroc(self) -> float | None:
+        """Mean over the frames of `FaultTold.in_picture`; None where no fault is known."""
+        return _mean(one.in_picture for one in self.faults)
+
+    @property
+    def fault_auroc_in_map(self) -> float | None:
+        """The same of `FaultTold.in_map`."""
+        return _mean(one.in_map for one in self.faults)
+
+
+def _mean(values: Iterable[float]) -> float | None:
+    finite = [value for value in values if math.isfinite(value)]
+    return statistics.fmean(finite) if finite else None
 
 
 class Observer:
@@ -89,7 +96,10 @@ class Observer:
         self._color, self._measures = color, measures
         self._rng = np.random.default_rng(config.seed)
         self._previous: Seen | None = None
-        self._used: tuple[Frame, Mask | None, Pose, int] | None = None
+        self._used: tuple[Frame, Plane | None, Mask | None, Pose, int] | None = None
+        self._poses = truth.sequence.ground_truth()
+        self._regional = [event for event in truth.events if event.region]
+        self._crossed = any(event.name == "moving object" for event in truth.events)
 
     def observe(self, frame: Frame, before: Reference, after: Reference, report: StepReport) -> None:
         """After a step: `before` is what the frame was tracked against, `after` what the next one will be."""
@@ -108,23 +118,43 @@ class Observer:
         right = frame.valid if fault is None else frame.valid & ~fault
         if true_depth is not None:
             self.found.depth.append(of_depth(claimed, true_depth, frame.valid, self._rng))
+        if self._crossed and true_depth is not None and fault is not None and frame.index in self._poses:
+            trust = torch.where(claimed.rendering.depth > 0, _trust(claimed.rendering), torch.nan)
+            look = Look(frame.index, trust, fault, true_depth, frame.camera, self._poses[frame.index])
+            self.found.looks.append(look)
         if self._color:
             shown = report.tracked.exposure.applied(before.exposure.applied(claimed.rendering.color))
             self.found.color.append(of_color(claimed, shown.clamp(0, 1), frame.color, right, self._rng))
         if self._used is not None and self._used[-1] == after.submap.index:
             self._follow(after, *self._used[:-1])
-        self._used = frame, fault, se3.inverse(after.T_map_reference) @ report.tracked.T_map_cam, after.submap.index
+        T_after_cam = se3.inverse(after.T_map_reference) @ report.tracked.T_map_cam
+        self._used = frame, true_depth, fault, T_after_cam, after.submap.index
 
-    def _follow(self, after: Reference, frame: Frame, fault: Mask | None, T_map_cam: Pose) -> None:
+    def _follow(
+        self, after: Reference, frame: Frame, true_depth: Plane | None, fault: Mask | None, T_map_cam: Pose
+    ) -> None:
         """What the map says of an earlier view, whose frame it has used by now."""
         rendering = render_view(after.submap, frame.camera, T_map_cam, self._rasterizer)
-        mapped = rendering.depth > 0
+        mapped, trust = rendering.depth > 0, _trust(rendering)
         if not bool(mapped.any()):
             return
-        trust = rendering.confidence[mapped] / rendering.alpha[mapped]
-        self.found.mean[frame.index] = float(trust.mean())
+        self.found.mean[frame.index] = float(trust[mapped].mean())
+        if true_depth is None:
+            return
         if fault is not None and int((fault & mapped).sum()) >= ENOUGH:
-            self.found.fault_auroc.append(auroc(-trust.numpy().astype(np.float64), fault[mapped].numpy()))
+            self.found.faults.append(of_fault(rendering, true_depth, fault))
+        if self._regional and frame.index in self._poses:
+            points = (frame.camera.rays() * true_depth[..., None]).reshape(-1, 3)
+            points = se3.transform(self._poses[frame.index], points).reshape(*true_depth.shape, 3)
+            for event in self._regional:
+                inside = mapped & (true_depth > 0) & event.region.contains(points)  # type: ignore[union-attr]
+                if int(inside.sum()) >= ENOUGH:
+                    self.found.regional.setdefault(event, {})[frame.index] = float(trust[inside].mean())
+
+
+def _trust(rendering: Rendering) -> Plane:
+    """Rendered confidence over opacity."""
+    return rendering.confidence / rendering.alpha.clamp_min(1e-3)
 
 
 def summary(judged: Iterable[Judged]) -> dict[str, dict[str, float | None]]:
@@ -184,7 +214,9 @@ class Watched:
     depth: Mapping[str, Mapping[str, float | None]]
     """By measure, as `summary` gives it."""
     fault_auroc: float | None
-    """As `Predictions.mean_fault_auroc`."""
+    """As `Predictions.fault_auroc`."""
+    fault_auroc_in_map: float | None
+    """As `Predictions.fault_auroc_in_map`."""
     curves: Mapping[str, Sparsification]
     """By measure: mean over the frames, each relative to the error of all its pixels; none if no frame has an error."""
     doubt: Values
@@ -202,9 +234,8 @@ class Watched:
             if curve.random > 0:
                 by_measure.setdefault(name, []).append(curve)
         curves = {name: _mean_curve(curves) for name, curves in by_measure.items()}
-        return Watched(
-            len(found.depth), summary(found.depth), found.mean_fault_auroc, curves, doubt[evenly], error[evenly]
-        )
+        faults = found.fault_auroc, found.fault_auroc_in_map
+        return Watched(len(found.depth), summary(found.depth), *faults, curves, doubt[evenly], error[evenly])
 
     def score(self, name: str, measure: str = OURS) -> float | None:
         """One of `depth`; None if it is not defined."""
@@ -213,7 +244,8 @@ class Watched:
     @property
     def figures(self) -> dict[str, Any]:
         """All but curves and pairs; for JSON."""
-        return {"frames": self.frames, "depth": self.depth, "fault_auroc": self.fault_auroc}
+        faults = {"fault_auroc": self.fault_auroc, "fault_auroc_in_map": self.fault_auroc_in_map}
+        return {"frames": self.frames, "depth": self.depth, **faults}
 
     def write(self, path: Path) -> None:
         """Put it at `path` as JSON, all of it or nothing."""
@@ -239,7 +271,8 @@ class Watched:
             }
             depth = {str(name): dict(scores) for name, scores in told["depth"].items()}
             pairs = np.array(told["doubt"], float), np.array(told["error"], float)
-            return Watched(int(told["frames"]), depth, told["fault_auroc"], curves, *pairs)
+            faults = told["fault_auroc"], told["fault_auroc_in_map"]
+            return Watched(int(told["frames"]), depth, *faults, curves, *pairs)
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
 
