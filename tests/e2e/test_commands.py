@@ -21,6 +21,7 @@ from tcgsplat.cli.progress import RunProgress
 from tcgsplat.cli.recorder import Part, begin
 from tcgsplat.config import SlamConfig, from_toml, with_settings
 from tcgsplat.datasets import open_sequence
+from tcgsplat.evaluation.metrics import Metric
 from tcgsplat.geometry import se3
 from tcgsplat.scene.trajectory import format_tum, parse_tum
 from tcgsplat.slam import StepReport
@@ -522,7 +523,8 @@ def test_demo_makes_everything_that_it_shows(tmp_path: Path, capsys: pytest.Capt
     assert [path.name for path in shown] == ["contact_sheet.png", "trajectory.png", "map.ply", "report.json"]
     assert all(path.stat().st_size > 100 for path in shown)
     report = json.loads(shown[-1].read_text())
-    assert all(f"{name} " in text for name in report if name != "evaluated")
+    assert all(str(Metric(**row)) in text for name, row in report.items() if name != "evaluated")
+    assert all(f"\n{name} " in text for name in ("ate_rmse", "psnr", "coverage", "submaps", "gaussians_map"))
 
     assert main(small) == 1
     assert "exists; choose another folder by --out, or make it anew by --overwrite" in capsys.readouterr().err

@@ -2,7 +2,6 @@
 
 import shutil
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -59,7 +58,7 @@ def command(args: Args) -> int:
     whole = world_map(run, rasterizer).submap
     write_gaussians(run.path / "map.ply", whole.gaussians, whole.confidence.value)
     cost = f"{summary}; kernels compiled in {summary.seconds_compiling:.1f} s before"
-    sys.stdout.write(_told(run.path, report.metrics, cost))
+    sys.stdout.write(_told(run.path, report.figures(), cost))
     return 0
 
 
@@ -83,9 +82,7 @@ def make_way(out: Path, *, overwrite: bool) -> None:
     shutil.rmtree(out / "sequence")
 
 
-def _told(folder: Path, values: Mapping[str, object], cost: str) -> str:
-    width = max(map(len, values))
-    metrics = "\n".join(f"  {name:<{width}}  {value}" for name, value in values.items())
+def _told(folder: Path, figures: str, cost: str) -> str:
     files = {
         "contact_sheet.png": "what the camera saw, the map's picture, depth and confidence",
         "trajectory.png": "the estimated path beside the true one",
@@ -93,8 +90,4 @@ def _told(folder: Path, values: Mapping[str, object], cost: str) -> str:
         "report.json": "the figures above, and what was evaluated",
     }
     paths = "\n".join(f"  {folder / name}  {what}" for name, what in files.items())
-    return (
-        f"A synthetic apartment without sensor noise: {cost}.\n{metrics}\n"
-        "Withheld are pictures that the map was not made of; psnr, ssim and depth_l1 alone are of those that it was.\n"
-        f"{paths}\n"
-    )
+    return f"A synthetic apartment without sensor noise: {cost}.\n\n{figures}\n\n{paths}\n"
