@@ -357,7 +357,7 @@ def test_means_and_spreads_by_hand():
     table = rows(tables.ate(some, ["clean", "moving"], SYNTHETIC))
     assert table[0] == ["method", "clean", "moving", "mean"]
     # the mean over sequences is of seed 0 alone: seed 1 lacks a sequence
-    assert table[2] == ["`default`", "2.00 ± 1.41", "5.00 (1 of 2 runs)", "3.00"]
+    assert table[2] == ["`default`", "2.000 ± 1.414", "5.000 (1 of 2 runs)", "3.000"]
     assert table[3] == ["`base`", "–", "–", "–"]
 
 
@@ -365,7 +365,7 @@ def test_differences_are_to_the_last_preset():
     some = [outcome("default", "clean", seed, 1.0) for seed in (0, 1)]
     some += [outcome("base", "clean", seed, 1.5) for seed in (0, 1)]
     table = rows(tables.differences(some, SYNTHETIC))
-    assert table[2][:3] == ["`default`", "ATE RMSE [cm] ↓", "-0.500"]
+    assert table[2][:3] == ["`default`", "ATE RMSE [%] ↓", "-33.3"]
     assert table[2][-2:] == ["2", "0"]
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from tcgsplat.errors import EvaluationError
-from tcgsplat.evaluation.paired import Run, bootstrap_means, paired_differences
+from tcgsplat.evaluation.paired import Run, bootstrap_means, paired_differences, relative_differences
 
 
 def results(effect: float, *, sequences: int = 6, seeds: int = 4, noise: float = 0.1) -> dict[Run, float]:
@@ -104,3 +104,12 @@ def test_arms_without_a_common_run_are_not_there_and_an_unknown_reference_is_ref
     assert [d.arm for d in paired_differences(values, "off")] == ["third"]
     with pytest.raises(EvaluationError, match="no result of the arm 'of'; there are off, ours, third"):
         paired_differences(values, "of")
+
+
+def test_relative_differences_are_percent_whatever_the_size_and_failures_are_left_out() -> None:
+    small, large = {("off", "a", 0): 0.01, ("ours", "a", 0): 0.008}, {("off", "b", 1): 50.0, ("ours", "b", 1): 40.0}
+    failed = {("off", "c", 0): 1.0, ("ours", "c", 0): 0.0}
+    (found,) = relative_differences(small | large | failed, "off")
+    assert (found.mean, found.low, found.high) == pytest.approx((-20.0, -20.0, -20.0))
+    assert found.by_sequence == pytest.approx({"a": -20.0, "b": -20.0})
+    assert (found.pairs, found.left_out) == (2, 1)

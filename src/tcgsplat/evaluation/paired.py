@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -55,7 +55,7 @@ def paired_differences(
     each, intervals called 95 % held the truth in 75 to 84 % of the cases for 3 sequences, 82 to 87 % for 5, 89 to 92 %
     for 8 and 93 to 95 % for 15 (the first figure where sequences differ most). With one it speaks of the seeds alone.
 
-    For ratios (an ATE 2 % worse) give logarithms of the measure; the differences are then logarithms of ratios.
+    For ratios (an ATE 2 % worse) see `relative_differences`.
 
     Args:
         results: The measure by arm, sequence and seed; what is not finite counts as a failed run.
@@ -75,6 +75,26 @@ def paired_differences(
         raise EvaluationError(f"no result of the arm {reference!r}; there are {', '.join(arms) or 'none at all'}")
     compared = (_compared(results, arm, reference, level, draws, seed) for arm in arms if arm != reference)
     return tuple(difference for difference in compared if difference is not None)
+
+
+def relative_differences(results: Mapping[Run, float], reference: str) -> tuple[PairedDifference, ...]:
+    """Compare every arm with a reference arm, in percent of it: `paired_differences` of logarithms, taken back.
+
+    Args:
+        results: As there; what is not above 0 counts as a failed run.
+        reference: The arm that all others are compared with.
+
+    Raises:
+        EvaluationError: if the reference arm has no result.
+    """
+    logarithms = {run: math.log(value) if value > 0 else math.nan for run, value in results.items()}
+    return tuple(_percent(one) for one in paired_differences(logarithms, reference))
+
+
+def _percent(one: PairedDifference) -> PairedDifference:
+    mean, low, high = (100 * math.expm1(value) for value in (one.mean, one.low, one.high))
+    by_sequence = {name: 100 * math.expm1(value) for name, value in one.by_sequence.items()}
+    return replace(one, mean=mean, low=low, high=high, by_sequence=by_sequence)
 
 
 def _compared(

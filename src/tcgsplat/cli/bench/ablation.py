@@ -20,7 +20,7 @@ from tcgsplat.cli.usage import UsageError
 from tcgsplat.config import SlamConfig, settings, value_text
 from tcgsplat.datasets.truth import Truth
 from tcgsplat.errors import ArchiveError, EvaluationError
-from tcgsplat.evaluation.paired import PairedDifference, paired_differences
+from tcgsplat.evaluation.paired import PairedDifference, paired_differences, relative_differences
 from tcgsplat.evaluation.uncertainty_plots import forest_plot
 from tcgsplat.evaluation.uncertainty_plots import write as write_figure
 from tcgsplat.render.backends import open_rasterizer
@@ -253,17 +253,7 @@ def differences(
     }
     if not any(arm == ARMS[0].name for arm, _, _ in values):
         return ()
-    if measure == "psnr":
-        return paired_differences(values, ARMS[0].name)
-    logarithms = {key: math.log(value) for key, value in values.items()}
-    return tuple(_percent(one) for one in paired_differences(logarithms, ARMS[0].name))
-
-
-def _percent(one: PairedDifference) -> PairedDifference:
-    """Of logarithms of ratios: how many percent more that is."""
-    mean, low, high = (100 * math.expm1(value) for value in (one.mean, one.low, one.high))
-    by_sequence = {name: 100 * math.expm1(value) for name, value in one.by_sequence.items()}
-    return replace(one, mean=mean, low=low, high=high, by_sequence=by_sequence)
+    return (paired_differences if measure == "psnr" else relative_differences)(values, ARMS[0].name)
 
 
 def difference_plot(runs: Sequence[Run], sequences: Sequence[str]):  # type: ignore[no-untyped-def]
@@ -332,7 +322,7 @@ def _paired(runs: Sequence[Run], arms: Sequence[Arm], groups: Mapping[str, Seque
         colors = {one.arm: one for one in differences(runs, sequences, "psnr")}
         for one in differences(runs, sequences):
             psnr = _interval(colors[one.arm], 2) if one.arm in colors else ("-", "-")
-            p = "-" if math.isnan(one.p_of_pairs) else f"{one.p_of_pairs:.3f}"
+            p = "-" if math.isnan(one.p_of_pairs) else f"{one.p_of_pairs:.3f}" if one.p_of_pairs >= 5e-4 else "< 0.001"
             rows.append((group, one.arm, told[one.arm], *_interval(one, 1), p, *psnr, str(one.pairs)))
     head = ("sequences", "arm", "guides", "ATE %", "95 % interval", "p", "PSNR dB", "95 % interval", "pairs")
     return tables.markdown(head, rows, left=3) if rows else "There is no pair yet."
@@ -341,9 +331,9 @@ def _paired(runs: Sequence[Run], arms: Sequence[Arm], groups: Mapping[str, Seque
 def _by_sequence(runs: Sequence[Run], arms: Sequence[Arm], sequences: Sequence[str]) -> str:
     found = {name: {one.arm: one for one in differences(runs, [name])} for name in sequences}
     rows = []
-    for arm in arms[1:]:
-        cells = (_told(found[name].get(arm.name)) for name in sequences)
-        rows.append((arm.name, *cells))
+    for arm in arms:
+        if any(arm.name in by_arm for by_arm in found.values()):
+            rows.append((arm.name, *(_told(found[name].get(arm.name)) for name in sequences)))
     return tables.markdown(("arm", *sequences), rows)
 
 

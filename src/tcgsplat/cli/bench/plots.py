@@ -37,7 +37,7 @@ def figures(outcomes: Sequence[Outcome], sequences: Sequence[str], suite: Suite)
     if len(suite.presets) > 1:
         differences = [one for one in paired(outcomes, "ate_rmse", suite.presets[-1]) if not math.isnan(one.mean)]
         if differences:
-            drawn["difference.svg"] = forest_plot(differences, measure="ATE RMSE", unit="mm", scale=10.0)
+            drawn["difference.svg"] = forest_plot(differences, measure="ATE RMSE", unit="%")
     return drawn | _of_confidence(outcomes, sequences, suite)
 
 

@@ -9,7 +9,7 @@ from tcgsplat.cli.bench.performing import WATCHED_EVERY, Outcome
 from tcgsplat.cli.bench.suites import Suite
 from tcgsplat.cli.bench.watching import Watched
 from tcgsplat.evaluation import published
-from tcgsplat.evaluation.paired import paired_differences
+from tcgsplat.evaluation.paired import paired_differences, relative_differences
 from tcgsplat.evaluation.prediction import BAD_METERS, BAD_SHARE
 from tcgsplat.evaluation.published import Table
 
@@ -24,7 +24,7 @@ def ate(outcomes: Outcomes, sequences: Sequence[str], suite: Suite) -> str:
         "ATE RMSE in cm, lower is better: all frames whose true pose is known, lost ones included, after rigid "
         "alignment."
     )
-    table = _by_sequence(outcomes, sequences, suite, "ate_rmse", 2, printed)
+    table = _by_sequence(outcomes, sequences, suite, "ate_rmse", 2 if printed else 3, printed)
     return f"{caption} {_source(printed)}\n\n{table}"
 
 
@@ -116,19 +116,19 @@ def differences(outcomes: Outcomes, suite: Suite) -> str:
 
 
 COMPARED: Final = {
-    "ate_rmse": ("ATE RMSE [cm] ↓", 3),
+    "ate_rmse": ("ATE RMSE [%] ↓", 1),
     "psnr_withheld": ("PSNR of views never mapped [dB] ↑", 3),
     "ms_per_frame": ("time of a frame [ms] ↓", 1),
 }  # fmt: skip
 
 
 def paired(outcomes: Outcomes, metric: str, reference: str) -> tuple:  # type: ignore[type-arg]
-    """Differences of a metric; none if the reference has no run with it."""
+    """Differences of a metric, that of the path's error in percent; none if the reference has no run with it."""
     values = {one.key: one.value(metric) for one in outcomes if one.state not in ("missing", "waiting")}
     results = {key: math.nan if value is None else value for key, value in values.items()}
     if not any(arm == reference for arm, _, _ in results):
         return ()
-    return paired_differences(results, reference)
+    return (relative_differences if metric == "ate_rmse" else paired_differences)(results, reference)
 
 
 def confidence(outcomes: Outcomes, suite: Suite) -> str:
