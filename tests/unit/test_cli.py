@@ -264,16 +264,12 @@ def test_compiling_is_announced_once_and_only_if_there_is_any():
 
 
 def test_the_first_ctrl_c_asks_and_the_second_insists(capsys: pytest.CaptureFixture[str]):
-    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in a shell's background job
-    try:
-        with pytest.raises(KeyboardInterrupt), stopping_on_interrupt() as stop:
-            assert not stop.is_set()
-            signal.raise_signal(signal.SIGINT)
-            assert stop.is_set()
-            signal.raise_signal(signal.SIGINT)
-        assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, inherited)
+    with pytest.raises(KeyboardInterrupt), stopping_on_interrupt() as stop:
+        assert not stop.is_set()
+        signal.raise_signal(signal.SIGINT)
+        assert stop.is_set()
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
     assert capsys.readouterr().err == "tcgsplat: stopping after this frame; Ctrl-C again to stop at once\n"
 
 

@@ -40,7 +40,7 @@ CONFIG = MapperConfig(
     max_keyframes=0,
 )
 GUIDED = ConfidenceConfig(  # the paper's, which leaves confidence alone until an update is judged
-    model="paper", guide_mapping=True, p_min=0.1, initial=0.3, step_scale_min=0.8, step_scale_max=1.2
+    model="paper", guide_mapping=True, p_min=0.1, initial=0.3, doubt_weight=1.0, step_scale_min=0.8, step_scale_max=1.2
 )
 UNGUIDED = replace(GUIDED, guide_mapping=False)
 T_SIDE = pose(0.05, 0.02, 0.0, degrees=(0, 12, 0))
@@ -271,15 +271,19 @@ class TestGuidance:
         guided = mapped(rasterizer, young, frame, T_SIDE, confidence=GUIDED)
         assert not same(a.submap.gaussians, guided.submap.gaussians)
 
-    def test_doubtful_pixels_count_up_to_twice(self, young: Submap, rasterizer: Rasterizer) -> None:
-        """Eq. 20 at the first step, before anything moves."""
+    @pytest.mark.parametrize("doubt", [1.0, -0.8])
+    def test_doubtful_pixels_count_up_to_twice_or_little(
+        self, young: Submap, rasterizer: Rasterizer, doubt: float
+    ) -> None:
+        """Eq. 20 at the first step, before anything moves: as the paper has it, and as the default has it."""
+        config = replace(GUIDED, doubt_weight=doubt)
         colour_only = {"iterations": 1, "ssim_weight": 0.0, "depth_weight": 0.0}
         for value in (1.0, 0.5, 0.1):
             submap = with_confidence(young, torch.full((len(young),), value))
             view = render_view(submap, CAMERA, se3.identity(), rasterizer)
             error = (view.color - Room().frame().color).abs().mean(dim=-1)
-            expected = 0.8 * float(((2 - value * view.alpha) * error).mean())
-            found = mapped(rasterizer, submap, confidence=GUIDED, **colour_only).loss
+            expected = 0.8 * float(((1 + doubt * (1 - value * view.alpha)) * error).mean())
+            found = mapped(rasterizer, submap, confidence=config, **colour_only).loss
             assert found == pytest.approx(expected, rel=1e-3)
 
     def test_the_certain_take_small_steps(self, young: Submap, rasterizer: Rasterizer) -> None:

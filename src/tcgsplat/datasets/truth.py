@@ -15,6 +15,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -201,7 +202,8 @@ def _read_events(path: Path) -> list[Event]:
         raise DatasetError(f"{path} is no list of events with name, first and last; make the sequence anew") from error
 
 
-def _region(corners: list[list[float]] | None) -> Region | None:
+def _region(corners: Any) -> Region | None:
+    """A region as its file has it, which may have anything."""
     if corners is None:
         return None
     (x0, y0, z0), (x1, y1, z1) = corners
