@@ -164,7 +164,8 @@ class SuiteArgs:
 @dataclass(frozen=True, kw_only=True)
 class Synthetic(SuiteArgs):
     """Make four recordings of the synthetic apartment (exact; depth as from a Kinect; with somebody walking about;
-    with jumps of brightness), run each preset on each with each seed, and write a page of tables and figures.
+    with jumps of brightness), run each preset on each with each seed, and write a page of tables and figures: path,
+    views, surface, times, whether confidence helps, and whether it is true.
 
     The data is made in OUT/data. What is finished is kept: the same command, or one with more seeds, goes on from
     there. Ctrl-C keeps what is finished. Every setting is a flag, as for `tcgsplat run`.
