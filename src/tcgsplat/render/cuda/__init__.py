@@ -1,0 +1,5 @@
+"""The GPU backend; see README.md for its design in one page."""
+
+from tcgsplat.render.cuda.rasterizer import CudaRasterizer
+
+__all__ = ["CudaRasterizer"]
