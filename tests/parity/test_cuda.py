@@ -14,6 +14,8 @@ from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.cuda import CudaRasterizer
 from tcgsplat.render.cuda.launching import Compiled, Signatures, compiled, nvrtc_library
 from tcgsplat.render.cuda.rasterizer import kernel_text
+from tcgsplat.render.cuda.ssim import similarity, ssim_text
+from tcgsplat.render.losses import _SSIM_RADIUS, SSIM_C1, SSIM_C2, ssim_map, ssim_window
 from tcgsplat.render.protocol import MIN_TRANSMITTANCE
 from tcgsplat.render.reference import ReferenceRasterizer
 
@@ -150,6 +152,24 @@ def test_nothing_in_view(place: str, folder: Path):
     assert not any(leaves[name].grad.any() for name in INPUTS)
 
 
+def test_similarity_and_its_derivative_are_those_of_the_cpu(place: str, folder: Path):
+    """On an image that is no multiple of a block, and one smaller than the window."""
+    text = ssim_text(_SSIM_RADIUS, SSIM_C1, SSIM_C2)
+    device = torch.device("cpu") if place == "emulated" else torch.device("cuda", 0)
+    kernels = EmulatedKernels(text, folder) if place == "emulated" else Compiled(text, device)
+    generator = torch.Generator().manual_seed(0)
+    for shape in ((37, 50, 3), (5, 7, 3)):
+        a, b = (torch.rand(shape, generator=generator) for _ in range(2))
+        b, upstream = 0.7 * a + 0.3 * b, torch.randn(shape, generator=generator)
+        expected, found = a.clone().requires_grad_(), a.to(device).requires_grad_()
+        similar = ssim_map(expected, b)
+        (similar * upstream).sum().backward()
+        got = similarity(kernels, found, b.to(device), ssim_window().to(device))
+        (got * upstream.to(device)).sum().backward()
+        assert (got.detach().cpu() - similar.detach()).abs().max() < 1e-5
+        assert (found.grad.cpu() - expected.grad).abs().max() < 1e-4 * expected.grad.abs().max()
+
+
 def test_arguments_are_those_that_the_text_declares():
     signatures = Signatures(kernel_text(4))
     assert set(signatures.arguments) == {"project", "list", "project_backward", "blend", "blend_backward"}
@@ -172,7 +192,8 @@ def test_nvrtc_takes_the_text(architecture: str):
         nvrtc = nvrtc_library()
     except BackendUnavailableError as error:
         pytest.skip(str(error))
-    assert compiled(nvrtc, kernel_text(4), architecture)[:4] == b"\x7fELF"
+    for text in (kernel_text(4), ssim_text(5, SSIM_C1, SSIM_C2)):
+        assert compiled(nvrtc, text, architecture)[:4] == b"\x7fELF"
     with pytest.raises(BackendUnavailableError, match="identifier"):
         compiled(nvrtc, "KERNEL", architecture)
 

@@ -1,5 +1,6 @@
 """Image errors as per-pixel maps; what to mask, weight and sum is the caller's choice."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,11 @@ def ssim_window(dtype: torch.dtype = torch.float32) -> Float[Tensor, " k"]:
     x = torch.arange(-_SSIM_RADIUS, _SSIM_RADIUS + 1, dtype=torch.float64)
     window = torch.exp(-0.5 * (x / _SSIM_SIGMA) ** 2)
     return (window / window.sum()).to(dtype)
+
+
+@cache
+def _window_on(device: torch.device) -> Tensor:
+    return ssim_window().to(device)
 
 
 class _CpuSsim(torch.autograd.Function):
@@ -63,12 +69,17 @@ def _blurred(images: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
 def ssim_map(rendered: Image, observed: Image) -> Float[Tensor, "h w 3"]:
     """Structural similarity at every pixel and channel, in [-1, 1] (Wang et al. 2004), differentiable by `rendered`.
 
-    On the CPU in float32 by kernels of its own, else in torch.
+    In float32 by kernels of its own on the CPU and on a GPU, else in torch.
     """
     a, b = rendered, observed
     if a.device.type == "cpu" and a.dtype == torch.float32:
         similarity: Tensor = _CpuSsim.apply(a, b)  # type: ignore[no-untyped-call]
         return similarity
+    if a.device.type == "cuda" and a.dtype == torch.float32:
+        from tcgsplat.render.cuda import ssim  # noqa: PLC0415  nobody without a GPU needs it
+
+        kernels = ssim.ssim_kernels(a.device, _SSIM_RADIUS, SSIM_C1, SSIM_C2)
+        return ssim.similarity(kernels, a, b, _window_on(a.device))
     mean_a, mean_b, aa, bb, ab = _blurred(torch.cat((a, b, a * a, b * b, a * b), dim=-1)).chunk(5, dim=-1)
     var_a, var_b, cov = aa - mean_a * mean_a, bb - mean_b * mean_b, ab - mean_a * mean_b
     structure = (2 * cov + SSIM_C2) / (var_a + var_b + SSIM_C2)

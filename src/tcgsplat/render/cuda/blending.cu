@@ -18,18 +18,39 @@ struct Blend {
 };
 
 // A warp covers eight by four pixels, which mostly lie in the same splats.
-__device__ inline void pixel_of(int tile, int tiles_x, int& x, int& y) {
-    const int warp = threadIdx.x / 32, lane = threadIdx.x & 31;
-    x = TILE * (tile % tiles_x) + 8 * (warp & 1) + (lane & 7);
-    y = TILE * (tile / tiles_x) + 4 * (warp >> 1) + (lane >> 3);
+#define WARP_WIDTH 8
+#define WARP_HEIGHT 4
+
+__device__ inline int left_of(int warp, int tile, int tiles_x) { return TILE * (tile % tiles_x) + WARP_WIDTH * (warp & 1); }
+__device__ inline int top_of(int warp, int tile, int tiles_x) { return TILE * (tile / tiles_x) + WARP_HEIGHT * (warp >> 1); }
+
+// What all threads of a block read of a splat.
+struct Shared {
+    float record[9];
+    float features[FEATURES];
+    unsigned warps;             // a bit for each that the splat reaches: most splats are smaller than a tile
+};
+
+__device__ inline void load(
+    Shared& splat, const float* records, const float* features, long long owner, int tile, int tiles_x
+) {
+#pragma unroll
+    for (int k = 0; k < 9; k++) splat.record[k] = records[RECORD * owner + k];
+#pragma unroll
+    for (int f = 0; f < FEATURES; f++) splat.features[f] = features[FEATURES * owner + f];
+    const float limit = limit_of(splat.record);
+    splat.warps = 0;
+#pragma unroll
+    for (int warp = 0; warp < WARPS; warp++) {
+        const int left = left_of(warp, tile, tiles_x), top = top_of(warp, tile, tiles_x);
+        splat.warps |= (least_within(splat.record, left, top, WARP_WIDTH, WARP_HEIGHT) <= limit) << warp;
+    }
 }
 
 KERNEL(blend, Blend) {
-    __shared__ float records[THREADS][9];
-    __shared__ float features[THREADS][FEATURES];
-    const int tile = blockIdx.x;
-    int x, y;
-    pixel_of(tile, a.tiles_x, x, y);
+    __shared__ Shared splats[THREADS];
+    const int tile = blockIdx.x, warp = threadIdx.x / 32, lane = threadIdx.x & 31;
+    const int x = left_of(warp, tile, a.tiles_x) + lane % WARP_WIDTH, y = top_of(warp, tile, a.tiles_x) + lane / WARP_WIDTH;
     const bool inside = x < a.width && y < a.height;
     const long long first = a.starts[tile], end = a.starts[tile + 1];
     float out[PLANES] = {}, through = 1.0f;
@@ -40,20 +61,19 @@ KERNEL(blend, Blend) {
         const int count = (int)(end - start < THREADS ? end - start : THREADS);
         if ((int)threadIdx.x < count) {
             const long long owner = a.owners[a.pairs[start + threadIdx.x]];
-#pragma unroll
-            for (int k = 0; k < 9; k++) records[threadIdx.x][k] = a.records[RECORD * owner + k];
-#pragma unroll
-            for (int f = 0; f < FEATURES; f++) features[threadIdx.x][f] = a.features[FEATURES * owner + f];
+            load(splats[threadIdx.x], a.records, a.features, owner, tile, a.tiles_x);
         }
         __syncthreads();
         for (int k = 0; k < count && !done; k++) {
-            const float* r = records[k];
+            const Shared& splat = splats[k];
+            if (!(splat.warps >> warp & 1)) continue;
+            const float* r = splat.record;
             const float dx = x - r[0], dy = y - r[1];
             const float alpha = r[5] * exp2f(-((r[2] * dx + r[3] * dy) * dx + r[4] * dy * dy));
             if (alpha < MIN_ALPHA) continue;
             const float weight = through * alpha;
 #pragma unroll
-            for (int f = 0; f < FEATURES; f++) out[f] += weight * features[k][f];
+            for (int f = 0; f < FEATURES; f++) out[f] += weight * splat.features[f];
             out[FEATURES] += weight * r[6];
             out[FEATURES + 1] += weight * (r[6] + r[7] * dx + r[8] * dy);
             out[FEATURES + 2] += weight;
@@ -86,13 +106,11 @@ struct BlendBackward {
 // Back to front. What lies behind a splat counts by one number, the sum of weight times what the loss asks for there.
 // Each pair's sums are written by the one block that has them, so that no order of adding is left to chance.
 KERNEL(blend_backward, BlendBackward) {
-    __shared__ float records[BATCH][9];
-    __shared__ float features[BATCH][FEATURES];
+    __shared__ Shared splats[BATCH];
     __shared__ float of_warps[WARPS][BATCH][SUMS];
     __shared__ int most_used;
     const int tile = blockIdx.x, lane = threadIdx.x & 31, warp = threadIdx.x / 32;
-    int x, y;
-    pixel_of(tile, a.tiles_x, x, y);
+    const int x = left_of(warp, tile, a.tiles_x) + lane % WARP_WIDTH, y = top_of(warp, tile, a.tiles_x) + lane / WARP_WIDTH;
     const bool inside = x < a.width && y < a.height;
     const long long first = a.starts[tile], pixel = (long long)y * a.width + x, plane = (long long)a.width * a.height;
     const int used = inside ? a.used[pixel] : 0;
@@ -107,19 +125,17 @@ KERNEL(blend_backward, BlendBackward) {
         const int start = stop > BATCH ? stop - BATCH : 0, count = stop - start;
         if ((int)threadIdx.x < count) {
             const long long owner = a.owners[a.pairs[first + start + threadIdx.x]];
-#pragma unroll
-            for (int k = 0; k < 9; k++) records[threadIdx.x][k] = a.records[RECORD * owner + k];
-#pragma unroll
-            for (int f = 0; f < FEATURES; f++) features[threadIdx.x][f] = a.features[FEATURES * owner + f];
+            load(splats[threadIdx.x], a.records, a.features, owner, tile, a.tiles_x);
         }
         __syncthreads();
         for (int k = count - 1; k >= 0; k--) {
-            const float* r = records[k];
+            const Shared& splat = splats[k];
+            const float* r = splat.record;
             const float dx = x - r[0], dy = y - r[1];
             const float alpha = r[5] * exp2f(-((r[2] * dx + r[3] * dy) * dx + r[4] * dy * dy));
             const bool seen = start + k < used && alpha >= MIN_ALPHA;
             float* sums = of_warps[warp][k];
-            if (!__any_sync(EVERYONE, seen)) {
+            if (!(splat.warps >> warp & 1) || !__any_sync(EVERYONE, seen)) {
                 for (int v = lane; v < SUMS; v += 32) sums[v] = 0.0f;
                 continue;
             }
@@ -130,7 +146,7 @@ KERNEL(blend_backward, BlendBackward) {
                 float asked = by_depth * r[6] + by_plane * (r[6] + r[7] * dx + r[8] * dy) + g[FEATURES + 2];
 #pragma unroll
                 for (int f = 0; f < FEATURES; f++) {
-                    asked += g[f] * features[k][f];
+                    asked += g[f] * splat.features[f];
                     value[(MOMENTS + f) / 16][(MOMENTS + f) % 16] = weight * g[f];
                 }
                 const float e = alpha * (through * asked - behind / (1.0f - alpha));

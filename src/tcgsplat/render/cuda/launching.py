@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Mapping
 from functools import cache
+from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
@@ -27,6 +28,13 @@ _ELEMENTS = MappingProxyType(
     {"float": torch.float32, "int": torch.int32, "long long": torch.int64, "unsigned char": torch.bool}
 )
 _FIELD = re.compile(r"(?:const )?(float|int|long long|unsigned char|[A-Z]\w*)(\*?) ([\w, ]+);")
+
+
+def source(constants: Mapping[str, str], *names: str) -> str:
+    """The text of kernels: constants, then files of this folder, one after the other."""
+    defined = "".join(f"#define {name} {value}\n" for name, value in constants.items())
+    here = files("tcgsplat.render.cuda")
+    return defined + "\n".join(here.joinpath(name).read_text() for name in names)
 
 
 @runtime_checkable

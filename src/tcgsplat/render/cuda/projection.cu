@@ -122,11 +122,11 @@ struct Project {
     Camera camera;
 };
 
-// Least value of a splat's quadratic form over the pixel centres of a tile, which may be rounded down a little.
-__device__ inline float least_in_tile(const float* record, int tile_x, int tile_y) {
+// Least value of a splat's quadratic form over the pixel centres of a rectangle, and over the points between them.
+__device__ inline float least_within(const float* record, int first_x, int first_y, int width, int height) {
     const float A = record[2], B = record[3], C = record[4];
-    const float left = TILE * tile_x - record[0], right = left + TILE - 1;
-    const float top = TILE * tile_y - record[1], bottom = top + TILE - 1;
+    const float left = first_x - record[0], right = left + width - 1;
+    const float top = first_y - record[1], bottom = top + height - 1;
     const float x = clamp(0.0f, left, right), y = clamp(0.0f, top, bottom);
     if (x == 0.0f && y == 0.0f) return 0.0f;
     // The form is convex and least at the centre, so it is least on a side that faces it.
@@ -142,10 +142,11 @@ __device__ inline float least_in_tile(const float* record, int tile_x, int tile_
     return least;
 }
 
-// Whether a tile is one of the splat's: rounding may let in one too many, never one too few.
+// Below which the form is where alpha >= MIN_ALPHA: rounding may let in one pixel too many, never one too few.
+__device__ inline float limit_of(const float* record) { return log2f(record[5] / MIN_ALPHA) * 1.0001f + 1e-4f; }
+
 __device__ inline bool reaches(const float* record, int tile_x, int tile_y) {
-    const float most = log2f(record[5] / MIN_ALPHA);
-    return least_in_tile(record, tile_x, tile_y) <= most * 1.0001f + 1e-4f;
+    return least_within(record, TILE * tile_x, TILE * tile_y, TILE, TILE) <= limit_of(record);
 }
 
 KERNEL(project, Project) {

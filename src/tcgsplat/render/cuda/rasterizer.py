@@ -9,7 +9,6 @@ added by atomics: the same input gives the same bits.
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
-from importlib.resources import files
 from typing import Any
 
 import torch
@@ -17,12 +16,11 @@ from torch import Tensor
 
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render import protocol
-from tcgsplat.render.cuda.launching import THREADS, Compiled, Kernels
+from tcgsplat.render.cuda.launching import THREADS, Compiled, Kernels, source
 from tcgsplat.render.protocol import Raster, Splats
 from tcgsplat.tensors import Pose
 
 TILE, RECORD, MOMENTS = 16, 12, 10  # as in the kernels' text
-_SOURCES = ("kernel.cuh", "projection.cu", "blending.cu")
 _CONSTANTS = ("NEAR_PLANE", "MIN_ALPHA", "MIN_TRANSMITTANCE", "BLUR", "PLANE_SOFTENING", "JACOBIAN_MARGIN")
 
 
@@ -30,9 +28,7 @@ def kernel_text(features: int) -> str:
     """All kernels as C++, for so many feature channels."""
     constants = {name: f"{getattr(protocol, name)!r}f" for name in _CONSTANTS}
     constants |= {"LOG2_E": "1.4426950408889634f", "FEATURES": str(features), "SUMS": str(_sums(features))}
-    defined = "".join(f"#define {name} {value}\n" for name, value in constants.items())
-    here = files("tcgsplat.render.cuda")
-    return defined + "\n".join(here.joinpath(name).read_text() for name in _SOURCES)
+    return source(constants, "kernel.cuh", "projection.cu", "blending.cu")
 
 
 def _sums(features: int) -> int:
