@@ -161,7 +161,8 @@ class Slam:
         slam, then = Slam(config, rasterizer, store=store), checkpoint
         slam.trajectory, slam.atlas, slam.motion, slam.delay = then.trajectory, then.atlas, then.motion, then.delay
         slam.submap = slam._anchored(then.atlas.T_world_map[then.sealed], index=then.sealed)
-        slam.reference = Reference(measured(store.load_submap(then.reference)), then.T_map_reference, then.exposure)
+        reference = measured(store.load_submap(then.reference)).to(slam._device)
+        slam.reference = Reference(reference, then.T_map_reference, then.exposure)
         slam._ids.next, slam._resumed_at = then.next_id, then.frame_index
         slam._generator.set_state(then.generator)
         if config.loop.enabled:
@@ -172,7 +173,7 @@ class Slam:
 
     def step(self, frame: Frame) -> StepReport:
         """Track, perhaps switch submap, perhaps map; the first frame's camera is the origin of the world."""
-        frame, sealed, found, clock = frame.to(self._device), None, None, _Laps()
+        frame, sealed, found, clock = frame.cpu(), None, None, _Laps()
         frame = smoothed(frame) if self.config.tracker.smoothing else frame
         self._since_mapped += 1
 
@@ -303,7 +304,7 @@ class Slam:
     def _switched(self, frame_index: int, tracked: Tracked, elsewhere: Submap | None) -> Submap:
         """Seal the active submap and begin the next one at a frame tracked in it, or found again in another one."""
         sealed, index = self._sealed(), len(self.atlas)
-        reference = sealed if elsewhere is None else elsewhere
+        reference = sealed if elsewhere is None else elsewhere.to(self._device)
         edge = odometry(index, reference.index, tracked.T_map_cam)
         self.submap = self._anchored(self.atlas.T_world_map[reference.index] @ tracked.T_map_cam, index)
         self.atlas = self.atlas.with_submap(self.submap.T_world_map)
@@ -334,10 +335,13 @@ class Slam:
         return replace(sealed, T_world_map=self.atlas.T_world_map[sealed.index])
 
     def _kept(self, sealed: Submap, checkpoint: Checkpoint | None, edge: Edge | None) -> Closure:
-        """Put a finished submap away, its holes closed by guesses, and compare it; runs beside all else."""
-        whole = sealed
+        """Put a finished submap away, its holes closed by guesses, and compare it; runs beside all else.
+
+        From here on it is in the CPU's memory, or on disk: a device holds what is tracked against and mapped.
+        """
+        whole = sealed.cpu()
         if self.config.mapper.complete:
-            whole = completed(sealed, self.config.mapper.seeding, self.config.confidence, self._rasterizer)
+            whole = completed(whole, self.config.mapper.seeding, self.config.confidence, self._rasterizer)
         self._store.keep(whole, checkpoint)
         return self._closer.closed(sealed.index, edge) if self.config.loop.enabled else Closure(sealed.index)
 

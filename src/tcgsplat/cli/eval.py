@@ -36,7 +36,7 @@ class Args:
     true_mesh: Path | None = None
     """The true surface, a PLY in the frame of the true poses."""
     backend: str = "auto"
-    """Rasterizer: auto, numba or reference."""
+    """Rasterizer: auto, numba, reference, cuda or gsplat."""
 
 
 def command(args: Args) -> int:

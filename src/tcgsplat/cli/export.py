@@ -33,7 +33,7 @@ class Args:
     out: Path | None = None
     """Folder to write into; the run directory if left out."""
     backend: str = "auto"
-    """Rasterizer for merging: auto, numba or reference."""
+    """Rasterizer for merging: auto, numba, reference, cuda or gsplat."""
 
 
 def command(args: Args) -> int:

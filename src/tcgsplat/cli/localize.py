@@ -37,7 +37,7 @@ class Args:
     out: Path | None = None
     """File to write the poses to; localized.txt in the run directory if left out."""
     backend: str = "auto"
-    """Rasterizer: auto, numba or reference."""
+    """Rasterizer: auto, numba, reference, cuda or gsplat."""
 
 
 def command(args: Args) -> int:

@@ -25,7 +25,7 @@ class Args:
     steps: int | None = None
     """So many optimisation steps a keyframe, instead of a time."""
     backend: str = "auto"
-    """Rasterizer: auto, numba or reference."""
+    """Rasterizer: auto, numba, reference, cuda or gsplat."""
 
 
 def command(args: Args) -> int:

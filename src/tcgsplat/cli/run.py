@@ -38,7 +38,7 @@ class Args:
     limit: int | None = None
     """Use no more than so many frames."""
     backend: str = "auto"
-    """Rasterizer: auto, numba or reference."""
+    """Rasterizer: auto, numba, reference, cuda or gsplat."""
     seed: int | None = None
     """Of all randomness; that of the preset if left out."""
     realtime: bool = False

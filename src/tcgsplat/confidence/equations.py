@@ -67,7 +67,7 @@ def scale_change(
     Returns:
         $d_s \ge 0$; its gradient at no change is zero.
     """
-    log_epsilon = log_scales.new_tensor(math.log(epsilon))
+    log_epsilon = log_scales.new_full((), math.log(epsilon))
     shifted, shifted_before = torch.logaddexp(log_scales, log_epsilon), torch.logaddexp(log_scales_before, log_epsilon)
     return _length(shifted - shifted_before)
 
@@ -319,8 +319,8 @@ def mapping_loss(
     regularization: Float[Tensor, ""],
     stability: Float[Tensor, ""],
     *,
-    color_weight: float,
-    depth_weight: float,
+    color_weight: float | Float[Tensor, ""],
+    depth_weight: float | Float[Tensor, ""],
     ssim_weight: float,
     regularization_weight: float,
 ) -> Float[Tensor, ""]:
@@ -410,7 +410,7 @@ def stability_loss(
         A loss that is zero, and has a zero gradient, when nothing is counted or nothing moves.
     """
     allowed = allowed_change(maturity, slack_min=slack_min, slack_max=slack_max)
-    total = weight * torch.relu(abnormal - allowed)[counted].sum()
+    total = weight * torch.where(counted, torch.relu(abnormal - allowed), 0.0).sum()
     return total / counted.sum().clamp_min(1) if reduction == "mean" else total
 
 

@@ -259,6 +259,10 @@ class ConfidenceState:
         """The same state on another device."""
         return ConfidenceState(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
+    def cpu(self) -> "ConfidenceState":
+        """The same state where numpy and the CPU's kernels can read it."""
+        return ConfidenceState(**{f.name: getattr(self, f.name).cpu() for f in fields(self)})
+
     @torch.no_grad()
     def experienced(self, pixels: PerGaussian, errors: PerGaussian, config: ConfidenceConfig) -> "ConfidenceState":
         """After a frame that the map had not seen: how far off was what each Gaussian is part of.

@@ -81,6 +81,7 @@ class Lpips:
         """
         if min(valid.shape) < _SMALLEST or not bool(valid.any()):
             return math.nan
+        a, b, valid = (image.to(next(iter(self.weights.values())).device) for image in (a, b, valid))
         distance = 0.0
         both = zip(self._features(torch.where(valid[..., None], a, b)), self._features(b), strict=True)
         for head, (one, other) in enumerate(both):

@@ -67,7 +67,7 @@ def adjoint(T: Pose) -> Float[Tensor, "6 6"]:
 
 def from_rotation_translation(R: Float[Tensor, "3 3"], t: Float[Tensor, "3"]) -> Pose:
     """Put a rotation and a translation (metres) together."""
-    bottom = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=R.dtype, device=R.device)
+    bottom = torch.eye(4, dtype=R.dtype, device=R.device)[3:]
     return torch.cat((torch.cat((R, t[:, None]), dim=1), bottom), dim=0)
 
 

@@ -64,6 +64,7 @@ class Localizer:
             submap: Where it may be.
             guesses: `T_map_cam`, the best first. None at all is a failure, too.
         """
+        frame = frame.to(submap.device)  # where its pictures are
         found = Localized(Tracked(se3.identity(), "nothing tells where in the map it might be"), "no guess")
         for guess in guesses:
             found = self._from(guess, frame, submap)

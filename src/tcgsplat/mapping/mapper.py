@@ -87,6 +87,7 @@ class Mapper:
             submap: The active one.
             known: What the submap before shows of a submap's first view.
         """
+        keyframe = keyframe.to(self._rasterizer.device)
         first, frame, T_map_cam = not submap.keyframes, keyframe.balanced, keyframe.T_map_cam
         rendering = None if first else render_view(submap, frame.camera, T_map_cam, self._rasterizer)
         seeds = seed(frame, T_map_cam, rendering, submap.gaussians, self._ids, self._generator, self._config.seeding)

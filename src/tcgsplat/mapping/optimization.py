@@ -70,14 +70,15 @@ class AutogradOptimization:
         self, submap: Submap, config: MapperConfig, confidence: ConfidenceConfig, rasterizer: Rasterizer
     ) -> None:
         self._config, self._confidence, self._rasterizer = config, confidence, rasterizer
-        self._submap, self._before = submap, submap.gaussians
-        self._adam = RowAdam(submap.gaussians, config.rates)
+        self._submap = submap.to(rasterizer.device)
+        self._before = self._submap.gaussians
+        self._adam = RowAdam(self._before, config.rates)
         self._loss_value = torch.zeros(())
 
     def step(self, view: int, frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
         """See `Optimization`."""
         keyframe, gaussians = self._submap.keyframes[view], self._adam.gaussians
-        frame, T_cam_map = keyframe.balanced, se3.inverse(keyframe.T_map_cam)
+        frame, T_cam_map = keyframe.to(self._rasterizer.device).balanced, se3.inverse(keyframe.T_map_cam)
         rendering = render(gaussians, self._submap.confidence.value, frame.camera, T_cam_map, self._rasterizer)
         loss = self._loss(rendering, frame, gaussians, self._before, self._submap)
         scale, literal = self._step_scale(self._submap), self._confidence.step_scale_mode == "gradient"
@@ -116,7 +117,7 @@ class AutogradOptimization:
         """Eq. 21; means over valid pixels, as the base system takes them."""
         config, guided = self._config, self._confidence.guide_mapping
         measured = frame.valid & (frame.depth > 0)
-        pixels = max(int(measured.sum()), 1)
+        pixels = measured.sum().clamp_min(1).double()  # of the loss's device, which is not asked for it
         weight = eq.mapping_weight(rendering.confidence, doubt=self._confidence.doubt_weight if guided else 0.0)
         # Where the picture saw nothing, the rendering is compared with itself, so that no window sees a false edge.
         seen = torch.where(frame.valid[..., None], rendering.color, frame.color)
@@ -127,8 +128,8 @@ class AutogradOptimization:
             1.0 - ssim_map(seen, frame.color).mean(),
             isotropy_error(gaussians.scales) if config.isotropy_weight > 0 else torch.zeros(()),
             self._stability(gaussians, before, submap, rendering.visible) if guided else torch.zeros(()),
-            color_weight=config.color_weight / pixels,
-            depth_weight=config.depth_weight / pixels,
+            color_weight=torch.full_like(pixels, config.color_weight) / pixels,
+            depth_weight=torch.full_like(pixels, config.depth_weight) / pixels,
             ssim_weight=config.ssim_weight,
             regularization_weight=config.isotropy_weight,
         )
@@ -145,7 +146,9 @@ class AutogradOptimization:
         with torch.no_grad():
             change = self_distance(gaussians, before, config) - state.baseline
             allowed = eq.allowed_change(maturity, slack_min=config.slack_min, slack_max=config.slack_max)
-            rows = (counted & (change > allowed)).nonzero().flatten()
+            over = counted & (change > allowed)
+        # A device would be waited for until it had counted them: there all are differentiated.
+        rows = over.nonzero().flatten() if over.is_cpu else slice(None)
         loss = eq.stability_loss(
             eq.abnormal_change(
                 self_distance(gaussians.picked(rows), before.picked(rows), config), state.baseline[rows]

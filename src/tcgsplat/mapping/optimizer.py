@@ -35,6 +35,41 @@ class LearningRates:
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 
 
+@dataclass(frozen=True)
+class _Rows:
+    """The rows of tables that take part in a step.
+
+    On the CPU they are picked, since most Gaussians are out of view. A device would be waited for until it had counted
+    them: there all rows are worked on, and those that take part are written.
+    """
+
+    picked: Tensor | None
+    """Their places; None where all rows are worked on."""
+    flags: PerGaussianFlag | None
+    """Of all rows, those to be written; None where all that is worked on is."""
+
+    @staticmethod
+    def of(visible: PerGaussianFlag | None, table: Tensor) -> "_Rows":
+        """The flagged rows of such a table; None for all."""
+        if visible is None or not table.is_cpu:
+            return _Rows(None, visible)
+        return _Rows(visible.nonzero().flatten(), None)
+
+    def read(self, table: Tensor) -> Tensor:
+        """The rows that are worked on."""
+        return table if self.picked is None else table[self.picked]
+
+    def write(self, table: Tensor, values: Tensor) -> None:
+        """Into a table, in place, what has become of these rows."""
+        if self.picked is not None:
+            table[self.picked] = values
+        elif self.flags is None:
+            table.copy_(values)
+        else:
+            flags = self.flags.view(-1, *[1] * (table.dim() - 1))
+            table.copy_(torch.where(flags, values, table))
+
+
 class RowAdam:
     """Adam over a set of Gaussians whose rows stay the same for the life of the optimiser.
 
@@ -84,25 +119,27 @@ class RowAdam:
             for name, gradient in zip(active, gradients, strict=True):
                 if gradient is None:
                     continue
-                rows = torch.arange(len(gradient)) if visible is None else visible.nonzero().flatten()
-                shape = (-1, *[1] * (gradient.dim() - 1))
+                rows = _Rows.of(visible, gradient)
                 g = torch.nan_to_num(
-                    gradient[rows], nan=0.0, posinf=0.0, neginf=0.0
+                    rows.read(gradient), nan=0.0, posinf=0.0, neginf=0.0
                 )  # one bad pixel must not end a map
                 if name in GEOMETRY and gradient_scale is not None:
-                    g = g * gradient_scale[rows, None]
-                self._steps[name][rows] += 1  # moments are as young as a row's first gradient
-                steps = self._steps[name][rows].view(shape)
-                first = self._first[name][rows].lerp(g, 1 - BETA_1)
-                second = BETA_2 * self._second[name][rows] + (1 - BETA_2) * g * g
-                self._first[name][rows], self._second[name][rows] = first, second
+                    g = g * rows.read(gradient_scale)[:, None]
+                age = rows.read(self._steps[name]) + 1  # moments are as young as a row's first gradient
+                steps = age.view(-1, *[1] * (gradient.dim() - 1))
+                first = rows.read(self._first[name]).lerp(g, 1 - BETA_1)
+                second = BETA_2 * rows.read(self._second[name]) + (1 - BETA_2) * g * g
+                rows.write(self._steps[name], age)
+                rows.write(self._first[name], first)
+                rows.write(self._second[name], second)
                 young_1, young_2 = ((1 - beta**steps).to(g) for beta in (BETA_1, BETA_2))
                 step = first / young_1 / ((second / young_2).sqrt() + EPSILON)
                 if name in GEOMETRY and step_scale is not None:
-                    step *= step_scale[rows, None]
+                    step *= rows.read(step_scale)[:, None]
                 if name == "sh":
                     step[:, 1:] *= 0.05
-                self._parameters[name][rows] -= pace * getattr(self._rates, name) * step
+                parameters = self._parameters[name]
+                rows.write(parameters, rows.read(parameters) - pace * getattr(self._rates, name) * step)
 
     def kept(self, keep: PerGaussianFlag) -> "RowAdam":
         """The optimiser of the flagged rows only, moments included."""

@@ -49,7 +49,7 @@ def refined(
         optimization.step(order.pop(), pace=LAST_PACE**done)
         steps += 1
     optimization.prune()
-    return optimization.submap()
+    return optimization.submap().to(submap.device)
 
 
 def for_seconds(seconds: float) -> Callable[[int], float]:

@@ -111,7 +111,7 @@ def seed(
     generator: torch.Generator,
     config: SeedingConfig,
 ) -> Gaussians:
-    """New Gaussians in the map frame for what a frame shows and the map lacks.
+    """New Gaussians in the map frame for what a frame shows and the map lacks, on the device of the frame.
 
     Args:
         frame: The frame to be mapped.
@@ -122,10 +122,13 @@ def seed(
         generator: Randomness of the `points` recipe.
         config: Recipe and constants.
     """
-    mask = needed(frame, rendering, config)
+    mask = needed(frame, rendering, config).cpu()
+    frame, device = frame.cpu(), frame.color.device
     if config.recipe == "surface":
-        return surface_seeds(frame, T_map_cam, mask, existing.sh_degree, ids, config)
-    return _point_seeds(frame, T_map_cam, mask, rendering is None, existing, ids, generator, config)
+        seeds = surface_seeds(frame, T_map_cam, mask, existing.sh_degree, ids, config)
+    else:
+        seeds = _point_seeds(frame, T_map_cam, mask, rendering is None, existing, ids, generator, config)
+    return seeds.to(device)
 
 
 def _lattice(height: int, width: int, spacing: int) -> Mask:
@@ -156,7 +159,7 @@ def _born(
 def surface_seeds(
     frame: Frame, T_map_cam: Pose, mask: Mask, sh_degree: int, ids: IdSource, config: SeedingConfig
 ) -> Gaussians:
-    """Discs in the map frame on what a frame shows at the flagged pixels, all of which must have a depth."""
+    """Discs in the map frame on what a frame shows at the flagged pixels, which must have a depth; on the CPU."""
     height, width = mask.shape
     chosen = mask & _lattice(height, width, config.spacing)
     depth = frame.depth[chosen]
@@ -212,7 +215,7 @@ def _point_seeds(
         picked = candidates[order[:limit]].sort().values
     points = ((frame.camera.rays() * frame.depth[..., None]).flatten(0, 1)[picked]) * (1 + config.push_back)
     means = se3.transform(T_map_cam, points)
-    everything = torch.cat((existing.means, means)).numpy()
+    everything = torch.cat((existing.means.cpu(), means)).numpy()
     if len(everything) > 3:
         distances = cKDTree(everything).query(means.numpy(), k=4)[0][:, 1:]
         spread = torch.from_numpy((distances**2).mean(axis=1)).clamp_min(1e-7).sqrt()

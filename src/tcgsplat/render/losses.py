@@ -25,9 +25,9 @@ def depth_error(rendered: Plane, observed: Plane) -> Plane:
     return torch.where(observed > 0, (rendered - observed).abs(), 0.0)
 
 
-def ssim_window(dtype: torch.dtype = torch.float32) -> Float[Tensor, " k"]:
-    """The Gaussian weights of SSIM's windows, 11 pixels wide."""
-    x = torch.arange(-_SSIM_RADIUS, _SSIM_RADIUS + 1, dtype=torch.float64)
+def ssim_window(dtype: torch.dtype = torch.float32, device: torch.device | None = None) -> Float[Tensor, " k"]:
+    """The Gaussian weights of SSIM's windows, 11 pixels wide; made where they are wanted, which nothing waits for."""
+    x = torch.arange(-_SSIM_RADIUS, _SSIM_RADIUS + 1, dtype=torch.float64, device=device)
     window = torch.exp(-0.5 * (x / _SSIM_SIGMA) ** 2)
     return (window / window.sum()).to(dtype)
 
@@ -59,7 +59,7 @@ class _CpuSsim(torch.autograd.Function):
 
 def _blurred(images: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
     """Gaussian window of 11 pixels and sigma 1.5, zeros beyond the border."""
-    window = ssim_window(images.dtype).to(images.device)
+    window = ssim_window(images.dtype, images.device)
     planes = images.permute(2, 0, 1)[:, None]
     across = torch.nn.functional.conv2d(planes, window[None, None, None, :], padding=(0, _SSIM_RADIUS))
     down = torch.nn.functional.conv2d(across, window[None, None, :, None], padding=(_SSIM_RADIUS, 0))
@@ -72,7 +72,7 @@ def ssim_map(rendered: Image, observed: Image) -> Float[Tensor, "h w 3"]:
     In float32 by kernels of its own on the CPU and on a GPU, else in torch.
     """
     a, b = rendered, observed
-    if a.device.type == "cpu" and a.dtype == torch.float32:
+    if a.is_cpu and a.dtype == torch.float32:
         similarity: Tensor = _CpuSsim.apply(a, b)  # type: ignore[no-untyped-call]
         return similarity
     if a.device.type == "cuda" and a.dtype == torch.float32:

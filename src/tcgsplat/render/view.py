@@ -1,9 +1,13 @@
 """From a submap and a camera to meaningful images: the one place where Gaussians become splats.
 
 Colour and confidence are composited as channels of one pass, so that Eq. 17's map has the very weights of the picture.
+
+**A picture is where its submap is.** Whatever device draws, a submap that is kept in the CPU's memory gives pictures
+there, and one that is on the device gives them there: nobody else need know where the drawing was done. Only `render`,
+for the loops of optimisation, wants everything on the rasterizer's device.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import torch
@@ -54,6 +58,18 @@ class Rendering:
         depth = self.composited_plane_depth if mode == "planar" else self.composited_depth
         return depth / self.alpha.clamp_min(1e-3)
 
+    def to(self, device: torch.device) -> "Rendering":
+        """The same images on another device; itself if they are there already."""
+        if self.alpha.device == device:
+            return self
+        return Rendering(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+    def cpu(self) -> "Rendering":
+        """The same images where numpy and the CPU's kernels can read them; itself if they are there already."""
+        if self.alpha.is_cpu:
+            return self
+        return Rendering(**{f.name: getattr(self, f.name).cpu() for f in fields(self)})
+
 
 def render(
     gaussians: Gaussians,
@@ -65,11 +81,11 @@ def render(
     """Draw Gaussians, differentiable in all of their parameters and in the pose.
 
     Args:
-        gaussians: n Gaussians in the map frame.
+        gaussians: n Gaussians in the map frame, on the rasterizer's device.
         confidence: p of each, composited alongside; detached, or tracking could lower its loss by moving towards
             doubtful regions.
         camera: Intrinsics.
-        T_cam_map: Map frame to camera frame.
+        T_cam_map: Map frame to camera frame; on the CPU or on the rasterizer's device.
         rasterizer: Backend.
     """
     return _drawn(_splats(gaussians, confidence, T_cam_map), camera, T_cam_map, rasterizer)
@@ -77,7 +93,7 @@ def render(
 
 @torch.no_grad()
 def render_view(submap: Submap, camera: Camera, T_map_cam: Pose, rasterizer: Rasterizer) -> Rendering:
-    """Draw a submap from a camera in its frame, without gradients."""
+    """Draw a submap from a camera in its frame, without gradients; the images are where the submap is."""
     return SubmapView(submap, rasterizer)(camera, T_map_cam)
 
 
@@ -87,16 +103,17 @@ class SubmapView:
     def __init__(self, submap: Submap, rasterizer: Rasterizer) -> None:
         self.submap = submap
         self._rasterizer = rasterizer
+        self._there = submap.to(rasterizer.device)
         self._splats: Splats | None = None
 
     @torch.no_grad()
     def __call__(self, camera: Camera, T_map_cam: Pose) -> Rendering:
-        """The view of a camera in the submap's frame."""
-        T_cam_map, submap = se3.inverse(T_map_cam), self.submap
+        """The view of a camera in the submap's frame; the images are where the submap is."""
+        T_cam_map, submap = se3.inverse(T_map_cam), self._there
         splats = self._splats or _splats(submap.gaussians, submap.confidence.value, T_cam_map)
         if submap.gaussians.sh_degree == 0:  # else colours depend on where they are seen from
             self._splats = splats
-        return _drawn(splats, camera, T_cam_map, self._rasterizer)
+        return _drawn(splats, camera, T_cam_map, self._rasterizer).to(self.submap.device)
 
 
 def blended(
@@ -108,20 +125,21 @@ def blended(
 ) -> Float[Tensor, "n c"]:
     """For each Gaussian the sum over all pixels of some images, times its weight T alpha in each pixel's blend.
 
-    This is drawing turned round: what a picture says, handed to those that it shows, and to none that they hide.
+    This is drawing turned round: what a picture says, handed to those that it shows, and to none that they hide. The
+    images are where the submap is, and so are the sums.
     """
-    gaussians = submap.gaussians
-    features = torch.zeros(len(gaussians), images.shape[-1], device=images.device, requires_grad=True)
+    gaussians = submap.gaussians.to(rasterizer.device)
+    features = torch.zeros(len(gaussians), images.shape[-1], device=rasterizer.device, requires_grad=True)
     opacities = gaussians.opacities.clamp_max(MAX_OPACITY)
     with torch.enable_grad():
         splats = Splats(gaussians.means, gaussians.quats, gaussians.scales, opacities, features)
         drawn = rasterizer(splats, camera, se3.inverse(T_map_cam)).features
-    (weighed,) = torch.autograd.grad(drawn, features, images)
-    return weighed
+    (weighed,) = torch.autograd.grad(drawn, features, images.to(rasterizer.device))
+    return weighed.to(submap.device)
 
 
 def _splats(gaussians: Gaussians, confidence: PerGaussian, T_cam_map: Pose) -> Splats:
-    viewpoint = se3.inverse(T_cam_map)[:3, 3].to(gaussians.means)
+    viewpoint = se3.inverse(T_cam_map)[:3, 3].to(gaussians.means, non_blocking=True)
     features = torch.cat((gaussians.colors(viewpoint), confidence.detach()[:, None]), dim=1)
     return Splats(
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities.clamp_max(MAX_OPACITY), features

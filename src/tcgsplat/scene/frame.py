@@ -53,3 +53,9 @@ class Frame:
         if self.color.device == device:
             return self
         return replace(self, color=self.color.to(device), depth=self.depth.to(device), valid=self.valid.to(device))
+
+    def cpu(self) -> "Frame":
+        """The same frame where numpy and the CPU's kernels can read it; itself if it is there already."""
+        if self.color.is_cpu:
+            return self
+        return replace(self, color=self.color.cpu(), depth=self.depth.cpu(), valid=self.valid.cpu())

@@ -136,13 +136,17 @@ class Gaussians:
         """Only the flagged rows, in their order."""
         return Gaussians(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
-    def picked(self, rows: Int[Tensor, " m"]) -> "Gaussians":
+    def picked(self, rows: Int[Tensor, " m"] | slice) -> "Gaussians":
         """The rows of the given places."""
         return Gaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def to(self, device: torch.device) -> "Gaussians":
         """The same Gaussians on another device."""
         return Gaussians(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+    def cpu(self) -> "Gaussians":
+        """The same Gaussians where numpy and the CPU's kernels can read them."""
+        return Gaussians(**{f.name: getattr(self, f.name).cpu() for f in fields(self)})
 
     def transformed(self, T_b_a: Float[Tensor, "4 4"]) -> "Gaussians":
         """The same Gaussians in frame b, given here in frame a; view-dependent colour turns along."""

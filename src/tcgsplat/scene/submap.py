@@ -29,6 +29,16 @@ class Keyframe:
         """The frame with its colours as the map keeps them: what mapping compares with."""
         return self.frame.unexposed(self.exposure)
 
+    def to(self, device: torch.device) -> "Keyframe":
+        """The same keyframe with its pictures on another device; itself if they are there already."""
+        frame = self.frame.to(device)
+        return self if frame is self.frame else replace(self, frame=frame)
+
+    def cpu(self) -> "Keyframe":
+        """The same keyframe with its pictures in the CPU's memory; itself if they are there already."""
+        frame = self.frame.cpu()
+        return self if frame is self.frame else replace(self, frame=frame)
+
 
 @dataclass(frozen=True)
 class Submap:
@@ -57,6 +67,24 @@ class Submap:
 
     def __len__(self) -> int:
         return len(self.gaussians)
+
+    @property
+    def device(self) -> torch.device:
+        """Where its Gaussians are, and the pictures that are drawn of them."""
+        return self.gaussians.means.device
+
+    def to(self, device: torch.device) -> "Submap":
+        """With its Gaussians and their confidence on another device; keyframes stay where they are, perhaps on disk."""
+        if self.device == device:
+            return self
+        return replace(self, gaussians=self.gaussians.to(device), confidence=self.confidence.to(device))
+
+    def cpu(self) -> "Submap":
+        """All of it, keyframes too, in the CPU's memory; itself if its Gaussians are there already."""
+        if self.gaussians.means.is_cpu:
+            return self
+        keyframes = tuple(keyframe.cpu() for keyframe in self.keyframes)
+        return replace(self, gaussians=self.gaussians.cpu(), confidence=self.confidence.cpu(), keyframes=keyframes)
 
     def grown(self, new: Gaussians, config: ConfidenceConfig, expected_error: PerGaussian | None = None) -> "Submap":
         """With new Gaussians appended; their confidence is born at this submap's clock (see `born_at`)."""

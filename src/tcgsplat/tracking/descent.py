@@ -60,8 +60,7 @@ def weighted_residual(rendering: Rendering, weight: Plane, frame: Frame, config:
             mask = mask & (rendering.alpha > config.min_alpha)
         if config.outlier_factor > 0:
             median = residual_depth.median()
-            if median > 0:
-                mask = mask & (residual_depth < config.outlier_factor * median)
+            mask = mask & ((residual_depth < config.outlier_factor * median) | ~(median > 0))
         soft = rendering.alpha**3 if config.soft_alpha else torch.ones_like(rendering.alpha)
         color_mask = mask if config.mask_color else frame.valid
     return eq.tracking_loss(
@@ -97,26 +96,26 @@ def descend(
         config: Constants.
         floor: w_min of Eq. 18; None weighs every pixel by 1 (the base system).
     """
-    gaussians = submap.gaussians
-    T_cam_map_guess = se3.inverse(guess)
-    q = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
-    t = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    device = rasterizer.device
+    frame, submap = frame.to(device), submap.to(device)
+    T_cam_map_guess = se3.inverse(guess).to(device)
+    q = torch.eye(4, dtype=torch.float64, device=device)[0].clone().requires_grad_()
+    t = torch.zeros(3, dtype=torch.float64, device=device, requires_grad=True)
     adam = torch.optim.Adam(
         [{"params": [q], "lr": config.rotation_rate}, {"params": [t], "lr": config.translation_rate}], amsgrad=True
     )
-    best: Descent | None = None
-    for iteration in range(config.iterations):
+    # The best pose so far stays on the device with its loss: no iteration waits to know them.
+    best, lowest = T_cam_map_guess, torch.full((), torch.inf, device=device)
+    for _ in range(config.iterations):
         T_cam_map = se3.from_rotation_translation(quaternion.to_matrix(q), t) @ T_cam_map_guess
-        rendering = render(gaussians, submap.confidence.value, frame.camera, T_cam_map, rasterizer)
+        rendering = render(submap.gaussians, submap.confidence.value, frame.camera, T_cam_map, rasterizer)
         weight = (
             torch.ones_like(rendering.alpha) if floor is None else eq.tracking_weight(rendering.confidence, floor=floor)
         )
         loss = weighted_residual(rendering, weight, frame, config)
-        value = float(loss.detach())
-        if best is None or value < best.loss:
-            best = Descent(se3.inverse(T_cam_map.detach()), iteration + 1, value)
+        better = loss.detach() < lowest
+        best, lowest = torch.where(better, T_cam_map.detach(), best), torch.where(better, loss.detach(), lowest)
         adam.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         adam.step()
-    assert best is not None
-    return Descent(best.T_map_cam, config.iterations, best.loss)
+    return Descent(se3.inverse(best.cpu()), config.iterations, float(lowest))

@@ -95,6 +95,7 @@ class Tracked:
 
 def _compared(rendering: Rendering, frame: Frame, gate: float) -> tuple[float, float, float]:
     """Share of the covered pixels that have a reading, share of those whose depth agrees, correlation of colours."""
+    rendering, frame = rendering.cpu(), frame.cpu()
     depth = rendering.depth
     both = (depth > 0) & (frame.depth > 0) & frame.valid
     agreeing = both & ((depth - frame.depth).abs() < gate * (1 + 0.5 * frame.depth))
@@ -129,7 +130,7 @@ class Tracker:
             rendering = render_view(submap, frame.camera, found.T_map_cam, self._rasterizer)
             compared = _compared(rendering, frame, self._config.alignment.gate)
             return self._believed(guess, Tracked(found.T_map_cam, "", found.iterations, *compared))
-        rendering = self._view_of(submap)(frame.camera, guess)
+        frame, rendering = frame.cpu(), self._view_of(submap)(frame.camera, guess).cpu()  # where the solver is
         if self._floor is None:
             weight = torch.ones_like(rendering.confidence)
         else:

@@ -47,7 +47,7 @@ class Track:
     config: Path | None = None
     """A TOML file of settings, such as the config.toml of a run."""
     backend: str = "auto"
-    """Rasterizer: auto, numba or reference."""
+    """Rasterizer: auto, numba, reference, cuda or gsplat."""
     seed: int | None = None
     """Of all randomness; that of the preset if left out."""
     json: Path | None = None
@@ -87,7 +87,7 @@ class Ablation:
     limit: int | None = None
     """Use no more than so many frames."""
     backend: str = "auto"
-    """Rasterizer: auto, numba or reference."""
+    """Rasterizer: auto, numba, reference, cuda or gsplat."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Loops:
     run: tyro.conf.Positional[Path | None] = None
     """A run directory; if left out, a walk through two synthetic rooms is made and mapped: some two minutes."""
     backend: str = "auto"
-    """Rasterizer: auto, numba or reference."""
+    """Rasterizer: auto, numba, reference, cuda or gsplat."""
     json: Path | None = None
     """File to write the figures to."""
 
@@ -128,7 +128,7 @@ class Confidence:
     config: Path | None = None
     """A TOML file of settings, such as the config.toml of a run."""
     backend: str = "auto"
-    """Rasterizer: auto, numba or reference."""
+    """Rasterizer: auto, numba, reference, cuda or gsplat."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +150,7 @@ class SuiteArgs:
     limit: int | None = None
     """Use no more than so many frames of each sequence."""
     backend: str = "auto"
-    """Rasterizer: auto, numba or reference."""
+    """Rasterizer: auto, numba, reference, cuda or gsplat."""
     lpips: Path | None = None
     """Weights for LPIPS, as for `tcgsplat eval`."""
     refine: int = 3

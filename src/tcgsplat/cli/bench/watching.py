@@ -107,8 +107,9 @@ class Observer:
         if not due or not len(before.submap):
             return
         T_map_cam = se3.inverse(before.T_map_reference) @ report.tracked.T_map_cam
+        here = before.submap.to(frame.color.device)
         claimed = claim(
-            before.submap, frame.camera, T_map_cam, self._rasterizer, self._config.confidence, self._rng, self._previous
+            here, frame.camera, T_map_cam, self._rasterizer, self._config.confidence, self._rng, self._previous
         )
         self._previous = seen(claimed, frame.depth, T_map_cam, before.submap.index)
         if self._measures is not None:
@@ -134,7 +135,8 @@ class Observer:
         self, after: Reference, frame: Frame, true_depth: Plane | None, fault: Mask | None, T_map_cam: Pose
     ) -> None:
         """What the map says of an earlier view, whose frame it has used by now."""
-        rendering = render_view(after.submap, frame.camera, T_map_cam, self._rasterizer)
+        submap = after.submap.to(frame.color.device)
+        rendering = render_view(submap, frame.camera, T_map_cam, self._rasterizer)
         mapped, trust = rendering.depth > 0, _trust(rendering)
         if not bool(mapped.any()):
             return
