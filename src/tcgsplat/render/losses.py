@@ -80,6 +80,11 @@ def ssim_map(rendered: Image, observed: Image) -> Float[Tensor, "h w 3"]:
 
         kernels = ssim.ssim_kernels(a.device, _SSIM_RADIUS, SSIM_C1, SSIM_C2)
         return ssim.similarity(kernels, a, b, _window_on(a.device))
+    return plain_ssim_map(a, b)
+
+
+def plain_ssim_map(a: Image, b: Image) -> Float[Tensor, "h w 3"]:
+    """The same in torch: on any device, differentiable by both."""
     mean_a, mean_b, aa, bb, ab = _blurred(torch.cat((a, b, a * a, b * b, a * b), dim=-1)).chunk(5, dim=-1)
     var_a, var_b, cov = aa - mean_a * mean_a, bb - mean_b * mean_b, ab - mean_a * mean_b
     structure = (2 * cov + SSIM_C2) / (var_a + var_b + SSIM_C2)
