@@ -329,7 +329,8 @@ def mapping_loss(
     $L_{map} = \sum_u W_{map}(u) [\lambda_c L_{rgb}(u) + \lambda_d L_{depth}(u)]
     + \lambda_s L_{ssim} + \lambda_r L_{reg} + L_{stab}$  (Eq. 21)
 
-    The base system takes means over the valid pixels; give color_weight / pixels and depth_weight / pixels for that.
+    The base system takes means over the valid pixels; give color_weight / pixels and depth_weight / pixels for that,
+    as tensors where a device has counted the pixels.
 
     Args:
         weight: $W_{map}$.
