@@ -72,7 +72,7 @@ def ssim_map(rendered: Image, observed: Image) -> Float[Tensor, "h w 3"]:
     In float32 by kernels of its own on the CPU and on a GPU, else in torch.
     """
     a, b = rendered, observed
-    if a.is_cpu and a.dtype == torch.float32:
+    if a.device.type == "cpu" and a.dtype == torch.float32:
         similarity: Tensor = _CpuSsim.apply(a, b)  # type: ignore[no-untyped-call]
         return similarity
     if a.device.type == "cuda" and a.dtype == torch.float32:
