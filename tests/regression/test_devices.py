@@ -3,6 +3,7 @@
 The device is the pretended one of `elsewhere.py`; where a real one is, `tests/parity` looks at that.
 """
 
+import shutil
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -16,6 +17,9 @@ if torch.cuda.is_available():
 
 from elsewhere import DEVICE, Distant, Near, counted_waits
 
+from tcgsplat.cli.bench import confidence as confidence_bench
+from tcgsplat.cli.bench import track as track_bench
+from tcgsplat.cli.main import main
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.config import SlamConfig, to_toml
 from tcgsplat.evaluation.prediction import claim
@@ -31,6 +35,7 @@ from tcgsplat.mapping.refinement import for_steps, refined
 from tcgsplat.mapping.schedule import ScheduleConfig
 from tcgsplat.mapping.seeding import IdSource, SeedingConfig
 from tcgsplat.mapping.settings import MapperConfig
+from tcgsplat.render import backends
 from tcgsplat.render.losses import plain_ssim_map
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import render_view
@@ -271,3 +276,29 @@ def test_finished_maps_are_worked_on_in_the_cpus_memory(
     claims = [claim(submap, CAMERA, T_TRUE, r, confidence, np.random.default_rng(0)) for r in (near, distant)]
     for name, doubt in claims[0].doubt.items():
         torch.testing.assert_close(claims[1].doubt[name], doubt, msg=name)
+
+
+@pytest.mark.slow
+def test_the_commands_work_there(
+    easy_walk: Path,
+    distant: Distant,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for module in (backends, confidence_bench, track_bench):
+        monkeypatch.setattr(module, "open_rasterizer", lambda *_: distant)
+    walk, run = tmp_path / "walk", str(tmp_path / "run")
+    shutil.copytree(easy_walk, walk)
+    for name in ("rgb.txt", "depth.txt"):
+        (walk / name).write_text("".join((walk / name).read_text().splitlines(keepends=True)[:31]))
+    assert main(["run", str(walk), "--out", run]) == 0
+    assert main(["eval", run]) == 0
+    assert main(["refine", run, "--steps", "4"]) == 0
+    assert main(["export", run]) == 0
+    assert main(["localize", run, str(walk), "--stride", "12"]) == 0
+    assert main(["bench", "track", str(walk)]) == 0
+    assert main(["bench", "confidence", str(walk), "--out", str(tmp_path / "page"), "--every", "10"]) == 0
+    report = (tmp_path / "run" / "report.json").read_text()
+    assert "psnr_withheld" in report and (tmp_path / "run" / "map.ply").stat().st_size > 10_000
+    assert "distant" in capsys.readouterr().out
