@@ -27,6 +27,7 @@ from tcgsplat.mapping.feedback import judged
 from tcgsplat.mapping.mapper import Mapper
 from tcgsplat.mapping.seeding import IdSource, SeedingConfig
 from tcgsplat.mapping.settings import MapperConfig
+from tcgsplat.render.availability import gpu_obstacles
 from tcgsplat.render.backends import open_rasterizer
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.submap import Keyframe, Submap
@@ -45,6 +46,14 @@ def room() -> Room:
 @pytest.fixture(scope="session")
 def rasterizer() -> Rasterizer:
     return open_rasterizer("numba")
+
+
+@pytest.fixture(scope="session")
+def cuda_device() -> torch.device:
+    """A GPU; the tests that ask for it are skipped where there is none, and say why."""
+    if obstacles := gpu_obstacles():
+        pytest.skip("; ".join(obstacles))
+    return torch.empty(0, device="cuda").device
 
 
 @pytest.fixture(scope="session")

@@ -67,19 +67,31 @@ def project(splats: Splats, camera: Camera, T_cam_map: Pose) -> Projected:
     covariance_uvz = M @ M.transpose(-1, -2)
     covariance_uv = covariance_uvz[:, :2, :2]
     eye = torch.eye(2, dtype=z.dtype, device=z.device)
-    slopes = torch.linalg.solve(covariance_uv + PLANE_SOFTENING * eye, covariance_uvz[:, :2, 2])
+    slopes = (inverted(covariance_uv + PLANE_SOFTENING * eye) @ covariance_uvz[:, :2, 2:])[..., 0]
     centers = torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), dim=-1)
     return Projected(centers, covariance_uv + BLUR * eye, centers_cam[:, 2], slopes)
 
 
+def inverted(covariances: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 2 2"]:
+    """Cramer's rule: `torch.linalg.inv` would ask the GPU for each one's success, and wait for the answer."""
+    a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
+    adjugate = torch.stack((c, -b, -b, a), dim=-1).reshape(-1, 2, 2)
+    return adjugate / (a * c - b * b)[:, None, None]
+
+
+def half_sizes(projected: Projected, opacities: PerGaussian) -> Float[Tensor, "n 2"]:
+    """Half the width and height, pixels, of the box around alpha >= MIN_ALPHA; nothing for those that are fainter."""
+    k = 2 * (opacities / MIN_ALPHA).log().clamp_min(0)
+    return (k[:, None] * projected.covariances.diagonal(dim1=-2, dim2=-1)).sqrt()
+
+
 def visible_footprints(projected: Projected, opacities: PerGaussian, camera: Camera) -> PerGaussianFlag:
     """Whether the box around alpha >= MIN_ALPHA holds a pixel centre of the image."""
-    k = 2 * (opacities / MIN_ALPHA).log()
-    half = (k.clamp_min(0)[:, None] * projected.covariances.diagonal(dim1=-2, dim2=-1)).sqrt()
+    half = half_sizes(projected, opacities)
     limit = torch.tensor([camera.width - 1, camera.height - 1], dtype=half.dtype, device=half.device)
     first = (projected.centers - half).ceil().clamp_min(0)
     last = torch.minimum((projected.centers + half).floor(), limit)
-    return (k >= 0) & (first <= last).all(dim=-1) & (projected.depths > NEAR_PLANE)
+    return (opacities / MIN_ALPHA >= 1) & (first <= last).all(dim=-1) & (projected.depths > NEAR_PLANE)
 
 
 class ReferenceRasterizer:

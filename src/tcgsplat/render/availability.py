@@ -1,0 +1,154 @@
+"""What keeps this machine from drawing on a GPU: sentences, each with the command that mends it.
+
+Nothing is compiled here, and torch is asked last: it tells that there is no GPU, and rarely why.
+"""
+
+import ctypes
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+_NO_DEVICE, _OTHER_DRIVER = 100, 803  # CUDA_ERROR_NO_DEVICE, CUDA_ERROR_SYSTEM_DRIVER_MISMATCH
+
+
+@dataclass(frozen=True)
+class Driver:
+    """NVIDIA's driver, asked without torch."""
+
+    cuda: tuple[int, int]
+    """Newest version of CUDA that it runs; of an older one, every minor version of this major one."""
+    status: int
+    """What starting it gives: 0 if there is a GPU, else an error of CUDA's driver."""
+
+    def __str__(self) -> str:
+        """For a sentence."""
+        return f"CUDA {self.cuda[0]}.{self.cuda[1]}"
+
+
+def driver() -> Driver | None:
+    """The one that is installed, or None."""
+    number = ctypes.c_int()
+    try:
+        library = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+        library.cuDriverGetVersion(ctypes.byref(number))
+        return Driver((number.value // 1000, number.value % 1000 // 10), library.cuInit(0))
+    except (OSError, AttributeError):  # no such file; a file that is something else
+        return None
+
+
+def torch_with_cuda(found: Driver | None) -> str:
+    """The command that installs a torch which this driver can run."""
+    newest = found.cuda if found else (13, 0)
+    build = "cu130" if newest >= (13, 0) else "cu128" if newest >= (12, 8) else "cu126"
+    return f"`pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/{build}`"
+
+
+def driver_obstacles(found: Driver | None) -> tuple[str, ...]:
+    """Why the driver does not give a GPU to anybody."""
+    if found is None:
+        return (
+            "there is no NVIDIA driver (libcuda cannot be loaded); install it (`sudo ubuntu-drivers install` on "
+            "Ubuntu, else from https://www.nvidia.com/drivers), or start the container with `--gpus all`",
+        )
+    if found.status == _NO_DEVICE:
+        shown = os.environ.get("CUDA_VISIBLE_DEVICES")
+        hidden = f"; CUDA_VISIBLE_DEVICES is {shown!r}: `unset CUDA_VISIBLE_DEVICES`" if shown is not None else ""
+        return (f"the driver ({found}) sees no GPU; `nvidia-smi -L` must list one{hidden}",)
+    if found.status == _OTHER_DRIVER:
+        return ("the driver's library and its kernel module differ in version: `sudo reboot` after an update",)
+    if found.status:
+        return (f"the driver ({found}) does not start, error {found.status}; `nvidia-smi` tells more",)
+    return ()
+
+
+def torch_obstacles(built: str | None, found: Driver | None) -> tuple[str, ...]:
+    """Why this torch cannot use that driver.
+
+    Args:
+        built: The version of CUDA that torch is built for, or None.
+        found: The driver, or None.
+    """
+    if built is None:
+        return (f"torch {torch.__version__} is built without CUDA: {torch_with_cuda(found)}",)
+    if found and found.cuda[0] < int(built.split(".")[0]):
+        return (
+            f"the driver runs {found} at most and torch is built for CUDA {built}: update the driver, or "
+            f"{torch_with_cuda(found)}",
+        )
+    return ()
+
+
+def gpu_obstacles() -> tuple[str, ...]:
+    """Why torch cannot use a GPU here; none if it can."""
+    found = driver()
+    obstacles = driver_obstacles(found) + torch_obstacles(torch.version.cuda, found)
+    if obstacles:
+        return obstacles
+    try:
+        torch.cuda.init()  # type: ignore[no-untyped-call]
+    except (RuntimeError, AssertionError) as error:
+        return (f"torch finds no GPU: {error}",)
+    major, minor = torch.cuda.get_device_capability()
+    oldest = min(int(re.sub(r"\D", "", name)) for name in torch.cuda.get_arch_list())
+    if 10 * major + minor < oldest:
+        return (
+            f"{torch.cuda.get_device_name()} has compute capability {major}.{minor}, and this torch needs "
+            f"{oldest // 10}.{oldest % 10}: `pip install --force-reinstall torch --index-url "
+            "https://download.pytorch.org/whl/cu126`",
+        )
+    return ()
+
+
+def toolkit() -> Path | None:
+    """Folder of CUDA's compiler, looked for where torch's builder of extensions does."""
+    named = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
+    found = shutil.which("nvcc")
+    home = Path(named) if named else Path(found).parents[1] if found else Path("/usr/local/cuda")
+    return home if (home / "bin" / "nvcc").exists() or (home / "bin" / "nvcc.exe").exists() else None
+
+
+def toolkit_version(home: Path) -> str:
+    """Such as 12.8; empty if its compiler does not tell."""
+    done = subprocess.run([home / "bin" / "nvcc", "--version"], capture_output=True, text=True, check=False)
+    found = re.search(r"release (\d+\.\d+)", done.stdout)
+    return found[1] if found else ""
+
+
+def compiler_obstacles(built: str) -> tuple[str, ...]:
+    """What is missing to compile an extension for a torch that is built for this version of CUDA."""
+    obstacles = []
+    home = toolkit()
+    advice = f"https://developer.nvidia.com/cuda-toolkit-archive, or `conda install -c nvidia cuda-toolkit={built}`"
+    if home is None:
+        obstacles.append(f"there is no nvcc, neither in CUDA_HOME nor on the PATH: install CUDA {built} ({advice})")
+    elif (version := toolkit_version(home)).split(".")[0] != built.split(".")[0]:
+        obstacles.append(
+            f"nvcc in {home} is of CUDA {version or 'unknown'} and torch is built for CUDA {built}: set CUDA_HOME to "
+            f"the folder of CUDA {built} ({advice})"
+        )
+    compiler = os.environ.get("CXX") or ("cl" if sys.platform == "win32" else "c++")
+    if shutil.which(compiler) is None:
+        obstacles.append(f"there is no C++ compiler ({compiler}): `sudo apt install g++`")
+    if shutil.which("ninja") is None:
+        obstacles.append("ninja is not on the PATH: `pip install ninja`, and activate the environment it is in")
+    return tuple(obstacles)
+
+
+def gsplat_obstacles() -> tuple[str, ...]:
+    """Why gsplat cannot be used; that its kernels will compile is not among what is known then."""
+    obstacles = list(gpu_obstacles())
+    missing = [name for name in ("gsplat", "packaging") if importlib.util.find_spec(name) is None]
+    if missing:
+        obstacles.append(f"{' and '.join(missing)} is not installed: `pip install 'tcgsplat[gsplat]'`")
+    elif importlib.util.find_spec("gsplat.csrc") is not None:  # a wheel with its kernels compiled
+        return tuple(obstacles)
+    if torch.version.cuda is not None:
+        obstacles += compiler_obstacles(torch.version.cuda)
+    return tuple(obstacles)
