@@ -11,7 +11,7 @@ from torch import Tensor
 from tcgsplat.errors import BackendUnavailableError
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.render.availability import gsplat_obstacles
+from tcgsplat.render.availability import extension_obstacles
 from tcgsplat.render.backends import open_rasterizer
 from tcgsplat.render.gsplat_cuda import TILE, Footprints, GsplatRasterizer, footprints, raster
 from tcgsplat.render.numba_cpu import NumbaRasterizer
@@ -25,7 +25,7 @@ Draw = Callable[[dict[str, Tensor]], Raster]
 
 @pytest.fixture(scope="session")
 def gsplat(cuda_device: torch.device) -> GsplatRasterizer:
-    if obstacles := gsplat_obstacles():
+    if obstacles := extension_obstacles():
         pytest.skip("; ".join(obstacles))
     return GsplatRasterizer(cuda_device)
 

@@ -328,5 +328,9 @@ def test_doctor_tells_what_can_be_used(capsys: pytest.CaptureFixture[str]):
     text = capsys.readouterr().out
     assert f"torch {torch.__version__}" in text
     assert "numba: usable\n" in text and "AVX-512" in text
-    assert "cuda: not usable\n  not built yet in this version" in text
+    if torch.cuda.is_available():
+        assert "cuda: usable\n  the default, on the GPU" in text
+    else:
+        assert "cuda: not usable\n" in text and "gsplat: not usable\n  what `cuda` needs comes first" in text
+        assert torch.version.cuda is not None or "is built without CUDA: `pip install " in text
     assert "compiled kernels are kept in" in doctor.numba_finding().facts[2]

@@ -30,18 +30,21 @@ class Finding:
 
 def command(args: Args) -> int:  # noqa: ARG001
     """Print the findings; the exit code is 0 if `tcgsplat run` can work here."""
+    import torch
+
     from tcgsplat.cli.summary import machine, versions
 
     packages = ", ".join(f"{name} {number}" for name, number in versions().items())
     reference = Finding("reference", True, ("plain torch, slow: for checking",))
-    findings = (numba_finding(), cuda_finding(), reference, mesh_finding())
+    numba, cuda = numba_finding(), cuda_finding()
+    findings = (numba, cuda, gsplat_finding(), reference, mesh_finding())
     sys.stdout.write(f"{packages}\n{platform.platform()}; {machine()}\n")
     sys.stdout.writelines(f"{finding}\n" for finding in findings)
-    return 0 if findings[0].usable else 1
+    return 0 if numba.usable and (cuda.usable or not torch.cuda.is_available()) else 1
 
 
 def numba_finding() -> Finding:
-    """The CPU backend."""
+    """The CPU backend; its kernels also work where a GPU draws, on what is done once a frame."""
     try:
         from tcgsplat.render.numba_cpu import blending
     except (ImportError, RuntimeError) as error:  # numba raises the latter where it finds no place for its cache
@@ -53,7 +56,7 @@ def numba_finding() -> Finding:
     compiled = any(cache.glob("blending.forward*.nbi"))
     place = f"compiled kernels are kept in {cache}"
     facts = (
-        "the default, on the CPU",
+        "the default where there is no GPU",
         "AVX-512: yes, the kernels' vectors fill its registers"
         if binding.get_host_cpu_features().get("avx512f")
         else "AVX-512: no; results are the same, more slowly; a processor with AVX-512 is faster",
@@ -65,19 +68,42 @@ def numba_finding() -> Finding:
 
 
 def cuda_finding() -> Finding:
-    """The GPU backend, which this version does not have."""
+    """The GPU backend, which has to compile its kernels and draw something before it is called usable."""
+    from tcgsplat.errors import BackendUnavailableError
+    from tcgsplat.render.availability import draw_something, driver, gpu_obstacles, torch_with_cuda
+    from tcgsplat.render.backends import open_rasterizer
+
+    if obstacles := gpu_obstacles():
+        return Finding("cuda", False, obstacles)
+    try:
+        draw_something(open_rasterizer("cuda"))
+    except BackendUnavailableError as error:
+        advice = "NVRTC, which compiles the kernels, comes with every torch that is built for CUDA"
+        until = "until then say `--backend numba`: `auto` takes the GPU where there is one"
+        return Finding("cuda", False, (str(error), f"{advice}: {torch_with_cuda(driver())}", until))
+    return Finding("cuda", True, ("the default, on the GPU; needs no compiler", gpu()))
+
+
+def gsplat_finding() -> Finding:
+    """The alternative on a GPU. It is not opened, since that would compile it."""
+    from tcgsplat.render.availability import extension_obstacles, gpu_obstacles
+
+    unseen = ("what `cuda` needs comes first",) if gpu_obstacles() else ()
+    if obstacles := unseen + extension_obstacles():
+        return Finding("gsplat", False, obstacles)
+    compiled = importlib.util.find_spec("gsplat.csrc") is not None
+    kernels = "its kernels are in the wheel" if compiled else "its kernels are compiled when first used, some minutes"
+    return Finding("gsplat", True, (f"gsplat {version('gsplat')}; {kernels}", gpu()))
+
+
+def gpu() -> str:
+    """The one that torch would use, and what torch is built for."""
     import torch
 
-    built = torch.version.cuda
-    if built is None:
-        device = f"torch {version('torch')} is built without CUDA; a build with it would see a GPU"
-    elif torch.cuda.is_available():
-        device = f"torch is built for CUDA {built} and sees {torch.cuda.get_device_name()}"
-    else:
-        device = f"torch is built for CUDA {built} and sees no GPU; `nvidia-smi` tells whether the driver does"
-    gsplat = "is installed" if importlib.util.find_spec("gsplat") else "is not installed"
-    return Finding(
-        "cuda", False, ("not built yet in this version: nothing to do but use the CPU", device, f"gsplat {gsplat}")
+    found = torch.cuda.get_device_properties(torch.cuda.current_device())
+    return (
+        f"{found.name}, {found.total_memory / 2**30:.1f} GiB, compute capability {found.major}.{found.minor}; torch is "
+        f"built for CUDA {torch.version.cuda}"
     )
 
 

@@ -54,6 +54,7 @@ class Args:
 
 def command(args: Args) -> int:
     """Run, and say in one line what came of it."""
+    from tcgsplat.cli.progress import say
     from tcgsplat.cli.recorder import Part, begin, recorded, resume
     from tcgsplat.cli.settings import resolved
     from tcgsplat.render.backends import open_rasterizer
@@ -64,6 +65,7 @@ def command(args: Args) -> int:
     part = Part(args.start, args.stride, args.limit)
     sequence = part.open(args.folder)
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
+    say(f"drawing with {rasterizer.name} on {rasterizer.device}")
     out = args.out or Path("runs") / sequence.name
     if args.resume and (out / "run.json").exists():
         run = resume(out, config, args.folder, part)

@@ -1,6 +1,6 @@
 """What keeps this machine from drawing on a GPU: sentences, each with the command that mends it.
 
-Nothing is compiled here, and torch is asked last: it tells that there is no GPU, and rarely why.
+To find out, nothing is compiled, and torch is asked last: it tells that there is no GPU, and rarely why.
 """
 
 import ctypes
@@ -14,6 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+
+from tcgsplat.geometry import se3
+from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.protocol import Rasterizer, Splats
 
 _NO_DEVICE, _OTHER_DRIVER = 100, 803  # CUDA_ERROR_NO_DEVICE, CUDA_ERROR_SYSTEM_DRIVER_MISMATCH
 
@@ -54,8 +58,9 @@ def driver_obstacles(found: Driver | None) -> tuple[str, ...]:
     """Why the driver does not give a GPU to anybody."""
     if found is None:
         return (
-            "there is no NVIDIA driver (libcuda cannot be loaded); install it (`sudo ubuntu-drivers install` on "
-            "Ubuntu, else from https://www.nvidia.com/drivers), or start the container with `--gpus all`",
+            "there is no NVIDIA driver (libcuda cannot be loaded); where there is an NVIDIA GPU, install it (`sudo "
+            "ubuntu-drivers install` on Ubuntu, else from https://www.nvidia.com/drivers), or start the container with "
+            "`--gpus all`",
         )
     if found.status == _NO_DEVICE:
         shown = os.environ.get("CUDA_VISIBLE_DEVICES")
@@ -94,7 +99,8 @@ def gpu_obstacles() -> tuple[str, ...]:
     try:
         torch.cuda.init()  # type: ignore[no-untyped-call]
     except (RuntimeError, AssertionError) as error:
-        return (f"torch finds no GPU: {error}",)
+        said = str(error).partition("\n")[0]
+        return (f"torch finds no GPU ({said}); `nvidia-smi` tells whether the driver does",)
     major, minor = torch.cuda.get_device_capability()
     oldest = min(int(re.sub(r"\D", "", name)) for name in torch.cuda.get_arch_list())
     if 10 * major + minor < oldest:
@@ -141,14 +147,26 @@ def compiler_obstacles(built: str) -> tuple[str, ...]:
     return tuple(obstacles)
 
 
-def gsplat_obstacles() -> tuple[str, ...]:
-    """Why gsplat cannot be used; that its kernels will compile is not among what is known then."""
-    obstacles = list(gpu_obstacles())
+def extension_obstacles() -> tuple[str, ...]:
+    """Why gsplat cannot be loaded or compiled, as far as one sees without doing so."""
     missing = [name for name in ("gsplat", "packaging") if importlib.util.find_spec(name) is None]
     if missing:
-        obstacles.append(f"{' and '.join(missing)} is not installed: `pip install 'tcgsplat[gsplat]'`")
-    elif importlib.util.find_spec("gsplat.csrc") is not None:  # a wheel with its kernels compiled
-        return tuple(obstacles)
-    if torch.version.cuda is not None:
-        obstacles += compiler_obstacles(torch.version.cuda)
-    return tuple(obstacles)
+        return (f"{' and '.join(missing)} not installed: `pip install 'tcgsplat[gsplat]'`", *_compilers())
+    return () if importlib.util.find_spec("gsplat.csrc") else _compilers()  # there, it was compiled by others
+
+
+def _compilers() -> tuple[str, ...]:
+    """Of this torch; one without CUDA compiles nothing, and with which CUDA the next one will be is not known."""
+    return compiler_obstacles(torch.version.cuda) if torch.version.cuda else ()
+
+
+def draw_something(rasterizer: Rasterizer) -> None:
+    """One splat on one pixel, and wait for it: then all that a backend compiles or loads is there.
+
+    Raises:
+        BackendUnavailableError: if it cannot be.
+    """
+    row = torch.ones(1, 3, device=rasterizer.device)
+    ahead = row * torch.tensor([0.0, 0.0, 1.0], device=rasterizer.device)
+    splats = Splats(ahead, torch.ones(1, 4, device=rasterizer.device), 0.1 * row, 0.5 * row[:, 0], row)
+    rasterizer(splats, Camera(fx=1.0, fy=1.0, cx=0.0, cy=0.0, width=1, height=1), se3.identity()).alpha.cpu()

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from tcgsplat.errors import BackendUnavailableError
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.render.availability import gsplat_obstacles
+from tcgsplat.render.availability import draw_something, extension_obstacles, gpu_obstacles
 from tcgsplat.render.protocol import Raster, Splats
 from tcgsplat.render.reference import half_sizes, inverted, project, visible_footprints
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag, Plane, Pose
@@ -111,11 +111,11 @@ class GsplatRasterizer:
         Raises:
             BackendUnavailableError: if torch has no GPU here, or gsplat is not installed or does not compile.
         """
-        if obstacles := gsplat_obstacles():
+        if obstacles := gpu_obstacles() + extension_obstacles():
             raise BackendUnavailableError(f"gsplat cannot draw here: {'; '.join(obstacles)}")
         self.device = torch.empty(0, device=device).device  # with its number, as tensors have it
         try:
-            composited(_speck(self.device), TILE, TILE)
+            draw_something(self)
         except (ImportError, AttributeError, RuntimeError, OSError) as error:  # as many as there are ways to fail
             raise BackendUnavailableError(
                 f"gsplat's kernels cannot be compiled or loaded: {error}; `VERBOSE=1 python -c 'from gsplat.cuda."
@@ -131,11 +131,3 @@ class GsplatRasterizer:
     def reserved(self) -> AbstractContextManager[None]:
         """See `Rasterizer`; a GPU shares itself."""
         return nullcontext()
-
-
-def _speck(device: torch.device) -> Footprints:
-    """One splat in a picture of one tile: enough to make gsplat compile or load all that it has."""
-    camera = Camera(fx=TILE, fy=TILE, cx=TILE / 2, cy=TILE / 2, width=TILE, height=TILE)
-    mean = torch.tensor([[0.0, 0.0, 1.0]], device=device)
-    quat, one = torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device), torch.ones(1, device=device)
-    return footprints(Splats(mean, quat, 0.1 * torch.ones_like(mean), 0.5 * one, mean), camera, torch.eye(4).double())

@@ -1,0 +1,105 @@
+"""What is said of a machine without a GPU, or with one that does not work yet."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from tcgsplat.render.availability import (
+    Driver,
+    compiler_obstacles,
+    draw_something,
+    driver_obstacles,
+    extension_obstacles,
+    gpu_obstacles,
+    torch_obstacles,
+    torch_with_cuda,
+)
+from tcgsplat.render.protocol import Rasterizer
+
+INDEX = "--index-url https://download.pytorch.org/whl/"
+
+
+@pytest.mark.parametrize(
+    ("found", "build"),
+    [
+        (None, "cu130"),
+        (Driver((13, 1), 0), "cu130"),
+        (Driver((12, 9), 0), "cu128"),
+        (Driver((12, 2), 0), "cu126"),
+    ],
+)
+def test_the_torch_that_is_proposed_fits_the_driver(found: Driver | None, build: str) -> None:
+    assert torch_with_cuda(found) == f"`pip install --force-reinstall torch {INDEX}{build}`"
+
+
+def test_no_driver_is_said_with_how_to_get_one() -> None:
+    (sentence,) = driver_obstacles(None)
+    assert "no NVIDIA driver" in sentence and "ubuntu-drivers install`" in sentence and "--gpus all" in sentence
+
+
+def test_a_hidden_gpu_is_said_with_what_hides_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    (sentence,) = driver_obstacles(Driver((12, 4), 100))
+    assert "sees no GPU" in sentence and "`unset CUDA_VISIBLE_DEVICES`" in sentence
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    (sentence,) = driver_obstacles(Driver((12, 4), 100))
+    assert "CUDA 12.4" in sentence and "nvidia-smi" in sentence and "VISIBLE" not in sentence
+
+
+def test_a_driver_that_does_not_start_is_said() -> None:
+    assert "reboot" in driver_obstacles(Driver((12, 4), 803))[0]
+    assert "error 999" in driver_obstacles(Driver((12, 4), 999))[0]
+    assert driver_obstacles(Driver((12, 4), 0)) == ()
+
+
+def test_a_torch_that_does_not_fit_is_said() -> None:
+    (sentence,) = torch_obstacles(None, Driver((12, 8), 0))
+    assert "without CUDA" in sentence and f"{INDEX}cu128`" in sentence
+    (sentence,) = torch_obstacles("13.0", Driver((12, 2), 0))
+    assert "at most" in sentence and f"{INDEX}cu126`" in sentence and "update the driver" in sentence
+    assert torch_obstacles("12.8", Driver((12, 2), 0)) == ()  # minor versions run each other's programs
+    assert torch_obstacles("12.8", Driver((13, 0), 0)) == ()
+
+
+def toolkit(folder: Path, release: str) -> Path:
+    """A folder with an nvcc that only tells its version, and the other tools."""
+    (folder / "bin").mkdir()
+    for name, says in (
+        ("nvcc", f"Cuda compilation tools, release {release}, V{release}.88"),
+        ("c++", ""),
+        ("ninja", ""),
+    ):
+        tool = folder / "bin" / name
+        tool.write_text(f"#!/bin/sh\necho '{says}'\n")
+        tool.chmod(0o755)
+    return folder
+
+
+def test_tools_that_fit_are_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_HOME", str(toolkit(tmp_path, "12.9")))
+    monkeypatch.setenv("PATH", f"{tmp_path}/bin:/usr/bin:/bin")
+    monkeypatch.delenv("CXX", raising=False)
+    assert compiler_obstacles("12.8") == ()
+    (sentence,) = compiler_obstacles("13.0")
+    assert "of CUDA 12.9" in sentence and "built for CUDA 13.0" in sentence and "CUDA_HOME" in sentence
+
+
+def test_each_tool_that_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_HOME", str(tmp_path))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("CXX", "g++-12")
+    nvcc, compiler, ninja = compiler_obstacles("12.8")
+    assert "no nvcc" in nvcc and "cuda-toolkit=12.8" in nvcc
+    assert "(g++-12)" in compiler and "`sudo apt install g++`" in compiler
+    assert "`pip install ninja`" in ninja
+
+
+def test_what_is_found_here_is_what_torch_finds() -> None:
+    assert (gpu_obstacles() == ()) is torch.cuda.is_available()
+    for sentence in (*gpu_obstacles(), *extension_obstacles()):
+        assert "`" in sentence and "\n" not in sentence, "names the command that mends it"
+
+
+def test_something_can_be_drawn(rasterizer: Rasterizer) -> None:
+    draw_something(rasterizer)
