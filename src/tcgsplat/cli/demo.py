@@ -24,6 +24,8 @@ class Args:
     """Of the whole walk; with fewer of them the camera moves faster."""
     width: int = 320
     """Pixels across; the height is three quarters of it."""
+    backend: str = "auto"
+    """Rasterizer: auto, numba, reference, cuda or gsplat."""
     overwrite: bool = False
     """Make the demo anew where there is one."""
     settings: Flags = field(default_factory=dict)
@@ -42,7 +44,7 @@ def command(args: Args) -> int:
     from tcgsplat.storage.world_map import world_map
 
     config = resolved(args.preset, None, args.settings, None)
-    rasterizer = open_rasterizer()
+    rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     make_way(args.out, overwrite=args.overwrite)
     data = args.out / "sequence"
     say(f"making the apartment: {data}")
