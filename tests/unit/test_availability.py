@@ -7,6 +7,7 @@ import torch
 
 from tcgsplat.render.availability import (
     Driver,
+    architecture_obstacles,
     compiler_obstacles,
     draw_something,
     driver_obstacles,
@@ -60,6 +61,25 @@ def test_a_torch_that_does_not_fit_is_said() -> None:
     assert "at most" in sentence and f"{INDEX}cu126`" in sentence and "update the driver" in sentence
     assert torch_obstacles("12.8", Driver((12, 2), 0)) == ()  # minor versions run each other's programs
     assert torch_obstacles("12.8", Driver((13, 0), 0)) == ()
+
+
+@pytest.mark.parametrize(
+    ("capability", "built", "build"),
+    [
+        ((8, 9), ["sm_80", "sm_86", "sm_90"], None),
+        ((6, 1), ["sm_75", "sm_80"], "cu126"),
+        ((12, 0), ["sm_80", "sm_90"], "cu130"),
+        ((12, 0), ["sm_80", "sm_90", "compute_90"], None),
+        ((8, 0), ["sm_86"], "cu126"),
+    ],
+)
+def test_a_gpu_that_torch_has_no_kernels_for_is_said(
+    capability: tuple[int, int], built: list[str], build: str | None
+) -> None:
+    said = architecture_obstacles("GeForce", capability, built)
+    assert [f"{INDEX}{build}`" in sentence and "GeForce" in sentence for sentence in said] == [True] * (
+        build is not None
+    )
 
 
 def toolkit(folder: Path, release: str) -> Path:

@@ -78,7 +78,7 @@ def cuda_finding() -> Finding:
     try:
         draw_something(open_rasterizer("cuda"))
     except BackendUnavailableError as error:
-        advice = "NVRTC, which compiles the kernels, comes with every torch that is built for CUDA"
+        advice = "NVRTC, which compiles the kernels, comes with torch; to install both again"
         until = "until then say `--backend numba`: `auto` takes the GPU where there is one"
         return Finding("cuda", False, (str(error), f"{advice}: {torch_with_cuda(driver())}", until))
     return Finding("cuda", True, ("the default, on the GPU; needs no compiler", gpu()))

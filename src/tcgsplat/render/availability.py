@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,6 +52,10 @@ def torch_with_cuda(found: Driver | None) -> str:
     """The command that installs a torch which this driver can run."""
     newest = found.cuda if found else (13, 0)
     build = "cu130" if newest >= (13, 0) else "cu128" if newest >= (12, 8) else "cu126"
+    return _install(build)
+
+
+def _install(build: str) -> str:
     return f"`pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/{build}`"
 
 
@@ -101,15 +106,27 @@ def gpu_obstacles() -> tuple[str, ...]:
     except (RuntimeError, AssertionError) as error:
         said = str(error).partition("\n")[0]
         return (f"torch finds no GPU ({said}); `nvidia-smi` tells whether the driver does",)
-    major, minor = torch.cuda.get_device_capability()
-    oldest = min(int(re.sub(r"\D", "", name)) for name in torch.cuda.get_arch_list())
-    if 10 * major + minor < oldest:
-        return (
-            f"{torch.cuda.get_device_name()} has compute capability {major}.{minor}, and this torch needs "
-            f"{oldest // 10}.{oldest % 10}: `pip install --force-reinstall torch --index-url "
-            "https://download.pytorch.org/whl/cu126`",
-        )
-    return ()
+    name, capability = torch.cuda.get_device_name(), torch.cuda.get_device_capability()
+    return architecture_obstacles(name, capability, torch.cuda.get_arch_list())
+
+
+def architecture_obstacles(name: str, capability: tuple[int, int], built: Sequence[str]) -> tuple[str, ...]:
+    """Why this torch has no kernels for that GPU.
+
+    Args:
+        name: Of the GPU.
+        capability: Its compute capability.
+        built: What torch is built for: `sm_86` runs on 8.6 and later ones of 8, `compute_86` on all later ones.
+    """
+    own = 10 * capability[0] + capability[1]
+    known = {entry: int(re.sub(r"\D", "", entry)) for entry in built}
+    if any(n <= own and (entry.startswith("compute") or n // 10 == own // 10) for entry, n in known.items()):
+        return ()
+    build = "cu126" if own < min(known.values(), default=0) else "cu130"  # which still has the oldest; the newest
+    return (
+        f"{name} has compute capability {capability[0]}.{capability[1]}, and this torch is built for "
+        f"{', '.join(built)}: {_install(build)}",
+    )
 
 
 def toolkit() -> Path | None:
