@@ -107,6 +107,37 @@ class Loops:
 
 
 @dataclass(frozen=True)
+class Gpu:
+    """Time what a GPU is for: an iteration of tracking and of mapping on random scenes, through our rasterizers and by
+    a bare loop of gsplat, in turn; and the whole system on a synthetic apartment, with its error and its memory.
+
+    The page is printed and goes to OUT/README.md, all figures to OUT/gpu.json, as they come. Every setting is a flag,
+    as for `tcgsplat run`, for the whole system.
+    """
+
+    backends: tuple[str, ...] = ()
+    """Rasterizers to time, the first of them end to end too; if left out, cuda and, where it is installed, gsplat."""
+    sizes: tuple[str, ...] = ("640x480x150000", "640x480x600000", "1200x680x150000", "1200x680x600000")
+    """Of the random scenes: width, height, Gaussians; none to leave them out."""
+    repeats: int = 10
+    """Timed runs of each contender on each scene."""
+    steps: int = 60
+    """Iterations of a run."""
+    presets: tuple[str, ...] = ("default", "paper-replica", "paper-tum", "paper-scannet")
+    """To run end to end; the first one on the CPU as well."""
+    frames: int = 300
+    """Of the synthetic sequence; 0 to leave it out."""
+    width: int = 640
+    """Pixels across of the synthetic sequence; the height is three quarters of it."""
+    config: Path | None = None
+    """A TOML file of settings over all presets."""
+    seed: int | None = None
+    """Of all randomness; that of the preset if left out."""
+    out: Path | None = None
+    """Folder for README.md, gpu.json and data/; runs/bench-gpu if left out."""
+
+
+@dataclass(frozen=True)
 class Confidence:
     """See whether confidence is true: what the map claims of a frame before it has seen it, against the true depth.
 
@@ -208,8 +239,8 @@ class Scannet(Recorded):
 
 @dataclass(frozen=True)
 class Args:
-    """Time the mapping's kernels on random scenes, the whole system on a recorded sequence, or loop closure; see what
-    it is worth on a sequence that confidence guides the system; or run a suite of sequences, and write the paper's
+    """Time the mapping's kernels on random scenes, the whole system on a recorded sequence, loop closure, or a GPU; see
+    what it is worth on a sequence that confidence guides the system; or run a suite of sequences, and write the paper's
     tables of it: synthetic, tum, replica or scannet.
     """
 
@@ -218,6 +249,7 @@ class Args:
             Annotated[Render, tyro.conf.subcommand("render")]
             | Annotated[Track, tyro.conf.subcommand("track")]
             | Annotated[Loops, tyro.conf.subcommand("loops")]
+            | Annotated[Gpu, tyro.conf.subcommand("gpu")]
             | Annotated[Ablation, tyro.conf.subcommand("ablation")]
             | Annotated[Synthetic, tyro.conf.subcommand("synthetic")]
             | Annotated[Tum, tyro.conf.subcommand("tum")]
@@ -244,6 +276,10 @@ def command(args: Args) -> int:
         from tcgsplat.cli.bench import confidence
 
         return confidence.command(args.what, args.settings)
+    if isinstance(args.what, Gpu):
+        from tcgsplat.cli.bench import gpu
+
+        return gpu.command(args.what, args.settings)
     if isinstance(args.what, SuiteArgs):
         from tcgsplat.cli.bench import suite
 
