@@ -20,6 +20,10 @@ class BackendUnavailableError(TCGSplatError):
     """A rasterizer backend was asked for by name and this machine cannot run it."""
 
 
+class DeviceMemoryError(TCGSplatError):
+    """A GPU had too little memory for a run to go on; what was finished by then is kept."""
+
+
 class ArchiveError(TCGSplatError):
     """A run directory or one of its files is missing, incomplete or of another version."""
 

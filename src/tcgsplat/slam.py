@@ -267,6 +267,24 @@ class Slam:
         self._finished_closure()
         return sealed
 
+    def rescue(self) -> Submap | None:
+        """The last submap kept after a step, or `finish`, has failed because a device had too little memory.
+
+        Nothing is computed on the device any more: an update under way is given up, and the submap is kept as it was
+        before that, or was seeded, with its holes open, and compared with none.
+        """
+        if self._updating is not None:
+            self._updating.exception()  # waits, and raises nothing
+            self._updating = None
+        self._keeping = deque(keeping for keeping in self._keeping if keeping.exception() is None)
+        self._finished_closure()
+        if not self.submap.keyframes:
+            return None
+        self.submap = self.submap.cpu()
+        sealed = self._sealed()
+        self._store.keep(sealed, None)
+        return sealed
+
     def _moved(self, frame: Frame) -> Tracked:
         """The frame tracked, and what it tells of motion and of the depth images' delay."""
         velocity = self.motion.steady
@@ -341,7 +359,11 @@ class Slam:
         """
         whole = sealed.cpu()
         if self.config.mapper.complete:
-            whole = completed(whole, self.config.mapper.seeding, self.config.confidence, self._rasterizer)
+            try:
+                whole = completed(whole, self.config.mapper.seeding, self.config.confidence, self._rasterizer)
+            except torch.OutOfMemoryError:  # the run ends; it cannot go on from here to the same bits
+                self._store.keep(whole, None)
+                raise
         self._store.keep(whole, checkpoint)
         return self._closer.closed(sealed.index, edge) if self.config.loop.enabled else Closure(sealed.index)
 

@@ -20,7 +20,7 @@ from tcgsplat.cli.summary import Summary, Tally
 from tcgsplat.config import SlamConfig, from_toml, settings, to_toml
 from tcgsplat.datasets import Sequence, open_sequence
 from tcgsplat.datasets.playback import Arrival, Clock, in_turn, play
-from tcgsplat.errors import ArchiveError
+from tcgsplat.errors import ArchiveError, DeviceMemoryError
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.frame import Frame
 from tcgsplat.slam import Reference, Slam, StepReport
@@ -132,6 +132,7 @@ def recorded(
 
     Raises:
         KeyboardInterrupt: at the second Ctrl-C, saying what is on disk.
+        DeviceMemoryError: if a GPU has too little memory; what was mapped by then is on disk, as after one Ctrl-C.
     """
     # A frame's arrays are small: handing an operation to a second thread costs more than it saves, measured 141 against
     # 104 ms a frame, and the splat kernels have threads of their own.
@@ -171,6 +172,11 @@ def recorded(
             summary.seconds_held, summary.seconds,
         )  # fmt: skip
     run.write_summary(summary.to_dict())
+    if summary.out_of_memory:
+        raise DeviceMemoryError(
+            f"the GPU's memory ran out after {summary.frames} frames; saved {summary}: {run.path}; repeat the run with "
+            "--overwrite and --max-gpu-memory GB, fewer than it has free, or with smaller pictures"
+        )
     return summary
 
 
@@ -189,7 +195,8 @@ def record(
         arrivals: Frames in order of time.
         run: Where to write the path at the end.
         observe: Called with every report, and the number of frames dropped before it.
-        stopped: Asked after every frame; if true, what there is gets sealed and the run ends.
+        stopped: Asked after every frame; if true, what there is gets sealed and the run ends. So it does where a GPU
+            has too little memory.
         watch: Sees every step. Its time is in none of the summary's, but mapping goes on beside it.
 
     Returns:
@@ -197,22 +204,27 @@ def record(
     """
     tally = Tally()
     started = before = time.perf_counter()
-    watching = 0.0
-    for arrival in arrivals:
-        reference = slam.reference
-        report = slam.step(arrival.frame)
-        tally.follow(arrival, time.perf_counter())
-        observe(report, arrival.dropped)
-        now = time.perf_counter()
-        tally.count(report, now - before - arrival.waited)
-        if watch is not None:
-            watch(arrival.frame, reference, slam.reference, report)
-        before = time.perf_counter()
-        watching += before - now
-        if stopped():
-            break
-    interrupted = stopped()
-    slam.finish()
+    watching, exhausted = 0.0, False
+    try:
+        for arrival in arrivals:
+            reference = slam.reference
+            report = slam.step(arrival.frame)
+            tally.follow(arrival, time.perf_counter())
+            observe(report, arrival.dropped)
+            now = time.perf_counter()
+            tally.count(report, now - before - arrival.waited)
+            if watch is not None:
+                watch(arrival.frame, reference, slam.reference, report)
+            before = time.perf_counter()
+            watching += before - now
+            if stopped():
+                break
+        interrupted = stopped()
+        slam.finish()
+    except torch.OutOfMemoryError as error:
+        logger.debug("out of memory", exc_info=error)
+        exhausted = interrupted = True
+        slam.rescue()
     run.write_trajectory(slam.trajectory, slam.atlas)
     summary = tally.summary(
         slam.trajectory,
@@ -222,4 +234,4 @@ def record(
         seconds=time.perf_counter() - started - watching,
         interrupted=interrupted,
     )
-    return replace(summary, depth_delay_ms=1e3 * slam.delay.seconds)
+    return replace(summary, depth_delay_ms=1e3 * slam.delay.seconds, out_of_memory=exhausted)

@@ -39,6 +39,9 @@ class Args:
     """Use no more than so many frames."""
     backend: str = "auto"
     """Rasterizer: auto, numba, reference, cuda or gsplat."""
+    max_gpu_memory: float | None = None
+    """GB that may be taken of the GPU, as far as it can be planned: older pictures wait in the CPU's memory, then the
+    least useful Gaussians go. The same as --mapper.max-gpu-memory."""
     seed: int | None = None
     """Of all randomness; that of the preset if left out."""
     realtime: bool = False
@@ -61,7 +64,8 @@ def command(args: Args) -> int:
 
     if args.resume and (args.overwrite or args.realtime):
         raise UsageError("--resume goes with neither --overwrite nor --realtime, which repeats nothing; leave one out")
-    config = resolved(args.preset, args.config, args.settings, args.seed)
+    limit = {} if args.max_gpu_memory is None else {"mapper.max_gpu_memory": repr(args.max_gpu_memory)}
+    config = resolved(args.preset, args.config, {**args.settings, **limit}, args.seed)
     part = Part(args.start, args.stride, args.limit)
     sequence = part.open(args.folder)
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name

@@ -54,6 +54,8 @@ class Summary:
     """Stopped by Ctrl-C; what had been seen by then is sealed and saved."""
     peak_rss_mb: float | None
     """Most memory that the process has held, MB of 2^20 bytes; None where the system does not tell."""
+    out_of_memory: bool = False
+    """Stopped because a GPU had too little memory; as `interrupted`, which is true then too."""
     resumed_at: int | None = None
     """Frame at which an interrupted run went on; all times are of what came after."""
     realtime: bool = False

@@ -1,5 +1,6 @@
 """Mapping: grow the submap where a frame shows something new, then optimise it over its keyframes (Eqs. 20 to 24)."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -10,6 +11,7 @@ from tcgsplat.confidence.expectation import expected_error, reading_error
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.keyframes import thinned
+from tcgsplat.mapping.memory import MemoryLimit, most_useful, paged
 from tcgsplat.mapping.optimization import Optimization, begin
 from tcgsplat.mapping.seeding import IdSource, seed
 from tcgsplat.mapping.settings import MapperConfig
@@ -19,6 +21,8 @@ from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.tensors import PerGaussian, Plane
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,9 @@ class Mapped:
 
 
 class Mapper:
-    """Grows and optimises the active submap. Keeps nothing between updates but its source of ids and randomness."""
+    """Grows and optimises the active submap. Keeps nothing between updates but its source of ids and randomness, and
+    what it has warned of.
+    """
 
     def __init__(
         self,
@@ -78,6 +84,8 @@ class Mapper:
         self._rasterizer = rasterizer
         self._ids = ids
         self._generator = generator
+        self._memory = MemoryLimit(config.max_gpu_memory)
+        self._warned: set[str] = set()
 
     def grown(self, keyframe: Keyframe, submap: Submap, known: Rendering | None = None) -> Grown:
         """The submap with a new keyframe taken in.
@@ -97,7 +105,8 @@ class Mapper:
             doubt = eq.sample_at(self.birth_error(frame, known if first else rendering), pixels)
         keyframes = thinned((*submap.keyframes, keyframe), self._config.max_keyframes)
         grown = replace(submap.grown(seeds, self._confidence, doubt), keyframes=keyframes)
-        return Grown(grown, len(seeds), first, submap, rendering)
+        grown, before = self._within_memory(grown, submap)
+        return Grown(grown, len(grown) - len(before), first, before, rendering)
 
     def optimized(self, grown: Grown) -> Mapped:
         """The grown submap, optimised over its keyframes."""
@@ -116,6 +125,29 @@ class Mapper:
     def disagreement(self, frame: Frame, rendering: Rendering) -> Plane:
         """See the function of that name; as `birth_error`."""
         return disagreement(frame, rendering)
+
+    def _within_memory(self, grown: Submap, before: Submap) -> tuple[Submap, Submap]:
+        """A grown submap and the one that it has grown from, without what the limit of memory leaves no room for."""
+        camera, degree = grown.keyframes[-1].frame.camera, self._config.sh_degree
+        most = self._memory.gaussians(camera, degree)
+        if most is not None and len(grown) > most:
+            self._warn_once("Gaussians", f"a submap has more Gaussians than fit: the least useful go, {most} stay")
+            keep = most_useful(grown, most)
+            grown, before = grown.kept(keep), before.kept(keep[: len(before)])
+        pictures = self._memory.pictures(camera, degree, len(grown))
+        if pictures is None:
+            return grown, before
+        keyframes = tuple(grown.keyframes)
+        held = paged(keyframes, pictures)
+        if any(one is not other for one, other in zip(held, keyframes, strict=True)):
+            held_here = f"the {pictures} newest stay" if pictures > 1 else "the newest stays"
+            self._warn_once("pictures", f"pictures of keyframes do not all fit: {held_here}, others are fetched")
+        return replace(grown, keyframes=held), before
+
+    def _warn_once(self, about: str, sentence: str) -> None:
+        if about not in self._warned:
+            self._warned.add(about)
+            logger.warning("GPU memory is limited to %g GB: %s", self._config.max_gpu_memory, sentence)
 
     def _optimized(self, submap: Submap, iterations: int) -> Optimization:
         """Adam over drawn keyframes; faint Gaussians are dropped halfway and at the end."""

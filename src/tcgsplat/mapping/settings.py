@@ -37,6 +37,10 @@ class MapperConfig:
     max_keyframes: int = 40
     """Keyframes that a submap keeps; redundant ones go first; 0 for all. Bounds memory and the share of old views
     while the camera stays within one submap. [ours] (base: all)"""
+    max_gpu_memory: float = 0.0
+    """GB of 2^30 bytes that a run may take of a GPU, as far as it can be planned; 0 for all there is. Where pictures of
+    keyframes would exceed it, older ones wait in the CPU's memory; where Gaussians of the active submap would, those
+    with the least opacity times confidence are dropped, on every backend alike. [ours]"""
     complete: bool = True
     """Whether a finished submap gets guessed Gaussians where its pictures show what the sensor could not measure; see
     `completion`. [ours]"""
@@ -51,6 +55,7 @@ class MapperConfig:
         for name in ("current_share", "min_opacity", "frozen_color_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"mapper.{name} is {getattr(self, name)!r}; it must be between 0 and 1")
-        for name in ("color_weight", "depth_weight", "ssim_weight", "isotropy_weight", "max_keyframes"):
+        weights = ("color_weight", "depth_weight", "ssim_weight", "isotropy_weight")
+        for name in (*weights, "max_keyframes", "max_gpu_memory"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"mapper.{name} is {getattr(self, name)!r}; it must be at least 0")

@@ -74,7 +74,7 @@ class Scene:
             evidence=torch.full((n,), 5.0),
         )
         submap = Submap(0, se3.identity(), gaussians, confidence, clock=6)
-        shown = render_view(_moved(submap, rasterizer.device), size.camera, se3.identity(), rasterizer)
+        shown = render_view(submap.to(rasterizer.device), size.camera, se3.identity(), rasterizer)
         color, depth = shown.color.cpu(), shown.depth.cpu()
         frame = Frame(0, 0.0, color, depth, torch.ones_like(depth, dtype=torch.bool), size.camera)
         return Scene(submap, frame, se3.exp(torch.tensor([0.01, 0.0, 0.005, 0.0, 0.005, 0.0], dtype=torch.float64)))
@@ -86,7 +86,7 @@ class Ours:
     def __init__(self, scene: Scene, rasterizer: Rasterizer) -> None:
         config, self.device = SlamConfig(), rasterizer.device
         frame = scene.frame.to(self.device)
-        submap = _moved(scene.submap, self.device)
+        submap = scene.submap.to(self.device)
         self._optimization = begin(
             replace(submap, keyframes=(Keyframe(frame, scene.guess),)), config.mapper, config.confidence, rasterizer
         )
@@ -167,9 +167,3 @@ def rasterization() -> Rasterize:
         raise BackendUnavailableError(f"gsplat cannot be imported ({error}); pip install 'tcgsplat[gsplat]'") from error
     rasterize: Rasterize = gsplat.rasterization
     return rasterize
-
-
-def _moved(submap: Submap, device: torch.device) -> Submap:
-    """A submap without keyframes on a device."""
-    confidence = ConfidenceState(**{name: table.to(device) for name, table in vars(submap.confidence).items()})
-    return replace(submap, gaussians=submap.gaussians.to(device), confidence=confidence)

@@ -182,9 +182,9 @@ def opened(names: tuple[str, ...]) -> tuple[tuple[Rasterizer, ...], Mapping[str,
             "there is no GPU that torch can use, so there is nothing to time; `tcgsplat doctor` tells what is missing, "
             "and --backends numba --sizes 320x240x40000 times the CPU"
         )
-    own = open_rasterizer("cuda")  # type: ignore[arg-type]  # as above
+    own = open_rasterizer("cuda")
     try:
-        return (own, open_rasterizer("gsplat")), {}  # type: ignore[arg-type]  # as above
+        return (own, open_rasterizer("gsplat")), {}
     except BackendUnavailableError as error:
         return (own,), {"gsplat": str(error)}
 
