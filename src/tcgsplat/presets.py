@@ -124,6 +124,7 @@ _PUBLISHED: tuple[tuple[str, _Three, Origin, str], ...] = (
     ("mapper.min_opacity", (0.1, 0.5, 0.5), "base", "pruning_thre"),
     ("mapper.frozen_color_share", _same(0.5), "base", "colour stands still until the pruning halfway"),
     ("mapper.max_keyframes", _same(0), "base", "every mapped frame of a submap stays"),
+    ("mapper.max_gpu_memory", _same(0.0), "base", "no limit"),
     ("mapper.complete", _same(False), "base", "what was not measured stays open"),
     ("mapper.sh_degree", _same(0), "base", "colour does not depend on the view"),
     ("schedule.map_every", (5, 1, 1), "base", "map_every"),

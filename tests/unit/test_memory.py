@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from analytic_room import Room, RoomSequence, pose, walk
+from analytic_room import CAMERA, Room, RoomSequence, pose, walk
 
 from tcgsplat.cli.recorder import record
 from tcgsplat.confidence.state import ConfidenceConfig
@@ -42,16 +42,16 @@ def test_no_limit_limits_nothing():
 
 def test_memory_is_shared_out_by_hand():
     free = 4 * 2**30 - 600 * 2**20 - 1000 * 640 * 480
-    row = 20 * ((3 + 3 + 4 + 1 + 3) * 4 + 8 + 4 * 4 + 2 * 8)
+    row = 16 * ((3 + 3 + 4 + 1 + 3) * 4 + 8 + 4 * 4 + 2 * 8)
     assert MemoryLimit(4.0).gaussians(VGA, 0) == free // row
     assert MemoryLimit(4.0).pictures(VGA, 0, 1_000_000) == (free - 1_000_000 * row) // (2 * 17 * 640 * 480)
-    assert MemoryLimit(4.0).gaussians(VGA, 3) == free // (row + 20 * 4 * 45)
+    assert MemoryLimit(4.0).gaussians(VGA, 3) == free // (row + 16 * 4 * 45)
 
 
 def test_a_row_is_what_the_tables_hold():
     submap = Submap.anchored(se3.identity(), 0, sh_degree=2)
     tables = (*vars(submap.gaussians).values(), *vars(submap.confidence).values())
-    assert memory._working_bytes(2) == 20 * sum(t[:0].new_zeros(1, *t.shape[1:]).nbytes for t in tables)
+    assert memory._working_bytes(2) == 16 * sum(t[:0].new_zeros(1, *t.shape[1:]).nbytes for t in tables)
 
 
 def test_a_small_limit_leaves_a_map_and_a_picture():
@@ -132,6 +132,35 @@ def test_a_limit_that_is_not_met_changes_no_bit(rasterizer: Rasterizer, monkeypa
     assert free.seeded == wide.seeded
     assert torch.equal(one.gaussians.means, other.gaussians.means)
     assert torch.equal(one.confidence.value, other.confidence.value)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="torch has room for one device beside the CPU")
+def test_older_pictures_wait_and_the_map_is_the_same(
+    rasterizer: Rasterizer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    from elsewhere import DEVICE, Distant  # it registers a device
+
+    def mapped(gb: float) -> Submap:
+        config = MapperConfig(
+            seeding=SeedingConfig(spacing=2), first_iterations=2, iterations=4, max_keyframes=0, max_gpu_memory=gb
+        )
+        mapper = Mapper(config, GUIDED, Distant(rasterizer), IdSource(), torch.Generator().manual_seed(0))
+        submap = Submap.anchored(se3.identity(), 0, device=DEVICE)
+        for index, T in enumerate(walk(5)):
+            submap = mapper.optimized(mapper.grown(Keyframe(Room().frame(T, index), T), submap)).submap
+        return submap
+
+    monkeypatch.setattr(memory, "OVERHEAD", 0)
+    own = len(mapped(0.0)) * memory._working_bytes(0) + memory.WORKING_BYTES_PER_PIXEL * CAMERA.width * CAMERA.height
+    assert not caplog.messages
+    pictures = 2 * memory.IMAGE_BYTES * CAMERA.width * CAMERA.height
+    with caplog.at_level(logging.WARNING):
+        free, tight = mapped(0.0), mapped((own + 2.5 * pictures) / memory.BYTES_PER_GB)
+    assert [keyframe.frame.color.device == DEVICE for keyframe in free.keyframes] == [True] * 5
+    assert [keyframe.frame.color.device == DEVICE for keyframe in tight.keyframes] == [False] * 3 + [True] * 2
+    assert torch.equal(free.gaussians.means.cpu(), tight.gaussians.means.cpu())
+    (told,) = caplog.messages
+    assert told.endswith(" GB: pictures of keyframes do not all fit: the 2 newest stay, others are fetched")
 
 
 # Out of memory.

@@ -16,11 +16,13 @@ BYTES_PER_GB = 2**30
 OVERHEAD = 600 * 2**20
 """Bytes that CUDA, torch and the kernels take before anything is drawn. Assumed, not measured."""
 WORKING_BYTES_PER_PIXEL = 1000
-"""Of the images while one frame is tracked and another mapped: channels, losses, and the derivatives of both. Added up
-from the tensors, not measured."""
-WORKING_COPIES = 20
-"""Of a Gaussian's own bytes during an update: two submaps, Adam's tables, gradients, splats and their places in tiles
-are some twelve, added up and not measured; the rest is for what the allocator cannot use."""
+"""Of the images while one frame is tracked and another mapped: channels, losses, and the derivatives of both. Torch's
+tensors were counted on a pretend device, 399 for mapping and 106 for tracking; rasterizer and allocator need the rest.
+"""
+WORKING_COPIES = 16
+"""Of a Gaussian's own 96 bytes (more with harmonics) during an update. Counted likewise, it takes 465 with Adam's
+tables and all gradients, and tracking 34; then there are the submap before, up to two in loop closure, and the
+rasterizer's tables and tiles: some ten copies. What the allocator cannot use comes on top."""
 IMAGE_BYTES = 3 * 4 + 4 + 1
 """Of a pixel of a keyframe: colour, depth, whether it is valid."""
 LEAST = 10_000
