@@ -2,15 +2,18 @@
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
-from analytic_room import CAMERA, Room, RoomSequence, pose, walk
+from analytic_room import Room, RoomSequence, pose, walk
 
+from tcgsplat.cli.main import main
 from tcgsplat.cli.recorder import record
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.config import SlamConfig, with_settings
 from tcgsplat.datasets.playback import in_turn
+from tcgsplat.datasets.synthetic import SynthConfig, synthesize
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.mapping import memory
@@ -134,35 +137,6 @@ def test_a_limit_that_is_not_met_changes_no_bit(rasterizer: Rasterizer, monkeypa
     assert torch.equal(one.confidence.value, other.confidence.value)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="torch has room for one device beside the CPU")
-def test_older_pictures_wait_and_the_map_is_the_same(
-    rasterizer: Rasterizer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-):
-    from elsewhere import DEVICE, Distant  # it registers a device
-
-    def mapped(gb: float) -> Submap:
-        config = MapperConfig(
-            seeding=SeedingConfig(spacing=2), first_iterations=2, iterations=4, max_keyframes=0, max_gpu_memory=gb
-        )
-        mapper = Mapper(config, GUIDED, Distant(rasterizer), IdSource(), torch.Generator().manual_seed(0))
-        submap = Submap.anchored(se3.identity(), 0, device=DEVICE)
-        for index, T in enumerate(walk(5)):
-            submap = mapper.optimized(mapper.grown(Keyframe(Room().frame(T, index), T), submap)).submap
-        return submap
-
-    monkeypatch.setattr(memory, "OVERHEAD", 0)
-    own = len(mapped(0.0)) * memory._working_bytes(0) + memory.WORKING_BYTES_PER_PIXEL * CAMERA.width * CAMERA.height
-    assert not caplog.messages
-    pictures = 2 * memory.IMAGE_BYTES * CAMERA.width * CAMERA.height
-    with caplog.at_level(logging.WARNING):
-        free, tight = mapped(0.0), mapped((own + 2.5 * pictures) / memory.BYTES_PER_GB)
-    assert [keyframe.frame.color.device == DEVICE for keyframe in free.keyframes] == [True] * 5
-    assert [keyframe.frame.color.device == DEVICE for keyframe in tight.keyframes] == [False] * 3 + [True] * 2
-    assert torch.equal(free.gaussians.means.cpu(), tight.gaussians.means.cpu())
-    (told,) = caplog.messages
-    assert told.endswith(" GB: pictures of keyframes do not all fit: the 2 newest stay, others are fetched")
-
-
 # Out of memory.
 
 
@@ -192,7 +166,7 @@ class ShortMapper(Mapper):
         return super().optimized(grown)
 
 
-def run_directory(path) -> RunDirectory:
+def run_directory(path: Path) -> RunDirectory:
     return RunDirectory.create(path, config_toml="", sequence="room")
 
 
@@ -204,7 +178,7 @@ def rescued(run: RunDirectory, rasterizer: Rasterizer, mapper=Mapper, frames: in
 
 
 @pytest.mark.parametrize("pictures", [1, 12, 25, 31])
-def test_what_was_mapped_before_memory_ran_out_is_kept(pictures: int, tmp_path):
+def test_what_was_mapped_before_memory_ran_out_is_kept(pictures: int, tmp_path: Path):
     run = run_directory(tmp_path / "run")
     summary = rescued(run, Short(pictures))
     assert (summary.out_of_memory, summary.interrupted) == (True, True)
@@ -218,14 +192,14 @@ def test_what_was_mapped_before_memory_ran_out_is_kept(pictures: int, tmp_path):
         assert len(submap) > 1000 and submap.keyframes and submap.gaussians.means.isfinite().all()
 
 
-def test_an_update_that_fails_leaves_what_was_seeded(tmp_path):
+def test_an_update_that_fails_leaves_what_was_seeded(tmp_path: Path):
     run = run_directory(tmp_path / "run")
     summary = rescued(run, NumbaRasterizer(1), ShortMapper)
     assert summary.out_of_memory and 4 < summary.frames < 20
     assert len(run.load_submap(0).keyframes) == 3
 
 
-def test_the_last_submap_is_kept_even_if_its_holes_stay_open(tmp_path):
+def test_the_last_submap_is_kept_even_if_its_holes_stay_open(tmp_path: Path):
     whole, short = run_directory(tmp_path / "whole"), run_directory(tmp_path / "short")
     counting = Short(10**6)
     before = rescued(whole, counting, frames=6)
@@ -236,3 +210,38 @@ def test_the_last_submap_is_kept_even_if_its_holes_stay_open(tmp_path):
     assert torch.equal(
         short.load_submap(0).gaussians.ids, whole.load_submap(0).gaussians.ids[: len(short.load_submap(0))]
     )
+
+
+# As a person meets it.
+
+
+def test_a_run_that_ran_out_says_what_is_kept_and_goes_on_from_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    synthesize(tmp_path / "rooms", SynthConfig(150, width=80, height=60, free_views=0), lambda *_: None)
+    out, drawn, left = tmp_path / "out", NumbaRasterizer.__call__, iter(range(40))
+    arguments = ["run", str(tmp_path / "rooms"), "--limit", "20", "--out", str(out)]
+    arguments += ["--schedule.submap-by", "interval", "--schedule.submap-interval", "8", "--max-gpu-memory", "1.5"]
+
+    def short(rasterizer: NumbaRasterizer, *given: object) -> object:
+        if next(left, None) is None:
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+        return drawn(rasterizer, *given)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(NumbaRasterizer, "__call__", short)
+        assert main(arguments) == 1
+    run = RunDirectory.open(out)
+    frames = run.summary()["frames"]
+    assert 0 < frames < 20 and run.summary()["out_of_memory"] is True
+    (told,) = [line for line in capsys.readouterr().err.splitlines() if "memory" in line]
+    assert told.startswith(f"tcgsplat: the GPU's memory ran out after {frames} frames; saved {frames} frames in ")
+    assert f": {out}; repeat the run with --overwrite and --max-gpu-memory GB, fewer than it has free" in told
+    assert "max_gpu_memory = 1.5" in run.config_toml
+    assert main([*arguments, "--resume"]) == 0
+    assert run.summary()["frames"] == 20 and run.summary()["out_of_memory"] is False
+
+
+def test_no_run_has_less_than_no_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["run", str(tmp_path), "--max-gpu-memory", "-2"]) == 2
+    assert capsys.readouterr().err == "tcgsplat: --mapper.max_gpu_memory is -2.0; it must be at least 0\n"

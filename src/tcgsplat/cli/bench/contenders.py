@@ -11,9 +11,9 @@ from torch import Tensor
 from tcgsplat.cli.bench.render import Size, scene
 from tcgsplat.confidence.state import ConfidenceState
 from tcgsplat.config import SlamConfig
-from tcgsplat.errors import BackendUnavailableError
 from tcgsplat.geometry import quaternion, se3
 from tcgsplat.mapping.optimization import begin
+from tcgsplat.render.backends import open_rasterizer
 from tcgsplat.render.protocol import BLUR, NEAR_PLANE, Rasterizer
 from tcgsplat.render.view import render_view
 from tcgsplat.scene.frame import Frame
@@ -117,6 +117,7 @@ class BareGsplat:
         # gsplat has the centre of the first pixel at 0.5, 0.5, we at the origin.
         intrinsics = [[camera.fx, 0, camera.cx + 0.5], [0, camera.fy, camera.cy + 0.5], [0, 0, 1]]
         self._K = torch.tensor([intrinsics], device=device)
+        self._last_row = torch.tensor([[0.0, 0.0, 0.0, 1.0]], device=device)
         self._T_cam_map = se3.inverse(scene.guess).float().to(device)
         raw = (gaussians.means, gaussians.quats, gaussians.log_scales, gaussians.logit_opacities)
         self._parameters = [table.clone().requires_grad_() for table in (*raw, gaussians.colors(torch.zeros(3)))]
@@ -130,8 +131,7 @@ class BareGsplat:
         adam = torch.optim.Adam([{"params": [q], "lr": 0.002}, {"params": [t], "lr": 0.01}], fused=True)
         for _ in range(steps):
             moved = torch.cat((quaternion.to_matrix(q), t[:, None]), dim=1)
-            last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], device=self.device)
-            self._follow(adam, fixed, torch.cat((moved, last)) @ self._T_cam_map)
+            self._follow(adam, fixed, torch.cat((moved, self._last_row)) @ self._T_cam_map)
         return q, t
 
     def map(self, steps: int) -> object:
@@ -157,13 +157,10 @@ def rasterization() -> Rasterize:
     """The function of gsplat that draws.
 
     Raises:
-        BackendUnavailableError: if gsplat is not installed, or torch sees no GPU.
+        BackendUnavailableError: if gsplat cannot draw here.
     """
-    if not torch.cuda.is_available():
-        raise BackendUnavailableError("gsplat needs a GPU, and torch sees none; `tcgsplat doctor` tells why")
-    try:
-        import gsplat
-    except ImportError as error:
-        raise BackendUnavailableError(f"gsplat cannot be imported ({error}); pip install 'tcgsplat[gsplat]'") from error
+    open_rasterizer("gsplat")  # it draws something, and says precisely what is missing where it cannot
+    import gsplat
+
     rasterize: Rasterize = gsplat.rasterization
     return rasterize
