@@ -19,10 +19,10 @@ WORKING_BYTES_PER_PIXEL = 1000
 """Of the images while one frame is tracked and another mapped: channels, losses, and the derivatives of both. Torch's
 tensors were counted on a pretend device, 399 for mapping and 106 for tracking; rasterizer and allocator need the rest.
 """
-WORKING_COPIES = 16
+WORKING_COPIES = 20
 """Of a Gaussian's own 96 bytes (more with harmonics) during an update. Counted likewise, it takes 465 with Adam's
-tables and all gradients, and tracking 34; then there are the submap before, up to two in loop closure, and the
-rasterizer's tables and tiles: some ten copies. What the allocator cannot use comes on top."""
+tables and all gradients, and tracking 34. Then there are the submap before and up to two in loop closure, 128 each, and
+of `render.cuda` some 200 and 100 for each tile: about fifteen copies. What the allocator cannot use comes on top."""
 IMAGE_BYTES = 3 * 4 + 4 + 1
 """Of a pixel of a keyframe: colour, depth, whether it is valid."""
 LEAST = 10_000
