@@ -1,22 +1,26 @@
 """What is said of a machine without a GPU, or with one that does not work yet."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from tcgsplat.errors import BackendUnavailableError
+from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.availability import (
     Driver,
     architecture_obstacles,
     compiler_obstacles,
-    draw_something,
     driver_obstacles,
     extension_obstacles,
     gpu_obstacles,
+    prove,
     torch_obstacles,
     torch_with_cuda,
 )
-from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.render.protocol import Raster, Rasterizer, Splats
+from tcgsplat.tensors import Pose
 
 INDEX = "--index-url https://download.pytorch.org/whl/"
 
@@ -121,5 +125,26 @@ def test_what_is_found_here_is_what_torch_finds() -> None:
         assert "`" in sentence and "\n" not in sentence, "names the command that mends it"
 
 
-def test_something_can_be_drawn(rasterizer: Rasterizer) -> None:
-    draw_something(rasterizer)
+class Blurring:
+    """A rasterizer that is wrong in one thing."""
+
+    name, device = "blurring", torch.device("cpu")
+
+    def __init__(self, rasterizer: Rasterizer, wrong: str) -> None:
+        self._rasterizer, self._wrong, self.reserved = rasterizer, wrong, rasterizer.reserved
+
+    def __call__(self, splats: Splats, camera: Camera, T_cam_map: Pose) -> Raster:
+        if self._wrong == "pose":
+            return self._rasterizer(splats, camera, T_cam_map.detach() + 0.9 * (T_cam_map - T_cam_map.detach()))
+        if self._wrong == "scales":
+            splats = replace(splats, scales=splats.scales.detach() + 0.9 * (splats.scales - splats.scales.detach()))
+        drawn = self._rasterizer(splats, camera, T_cam_map)
+        return replace(drawn, plane_depth=drawn.depth) if self._wrong == "picture" else drawn
+
+
+def test_a_rasterizer_proves_itself_unless_it_draws_wrongly(rasterizer: Rasterizer) -> None:
+    prove(rasterizer)
+    prove(Blurring(rasterizer, "nothing"))
+    for wrong in ("picture", "pose", "scales"):
+        with pytest.raises(BackendUnavailableError, match=rf"blurring draws wrongly .*\({wrong}"):
+            prove(Blurring(rasterizer, wrong))

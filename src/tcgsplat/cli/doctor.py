@@ -30,17 +30,15 @@ class Finding:
 
 def command(args: Args) -> int:  # noqa: ARG001
     """Print the findings; the exit code is 0 if `tcgsplat run` can work here."""
-    import torch
-
     from tcgsplat.cli.summary import machine, versions
 
     packages = ", ".join(f"{name} {number}" for name, number in versions().items())
     reference = Finding("reference", True, ("plain torch, slow: for checking",))
-    numba, cuda = numba_finding(), cuda_finding()
-    findings = (numba, cuda, gsplat_finding(), reference, mesh_finding())
+    numba = numba_finding()
+    findings = (numba, cuda_finding(), gsplat_finding(), reference, mesh_finding())
     sys.stdout.write(f"{packages}\n{platform.platform()}; {machine()}\n")
     sys.stdout.writelines(f"{finding}\n" for finding in findings)
-    return 0 if numba.usable and (cuda.usable or not torch.cuda.is_available()) else 1
+    return 0 if numba.usable else 1
 
 
 def numba_finding() -> Finding:
@@ -70,17 +68,16 @@ def numba_finding() -> Finding:
 def cuda_finding() -> Finding:
     """The GPU backend, which has to compile its kernels and draw something before it is called usable."""
     from tcgsplat.errors import BackendUnavailableError
-    from tcgsplat.render.availability import draw_something, driver, gpu_obstacles, torch_with_cuda
+    from tcgsplat.render.availability import driver, gpu_obstacles, torch_with_cuda
     from tcgsplat.render.backends import open_rasterizer
 
     if obstacles := gpu_obstacles():
         return Finding("cuda", False, obstacles)
     try:
-        draw_something(open_rasterizer("cuda"))
-    except BackendUnavailableError as error:
+        open_rasterizer("cuda")
+    except (BackendUnavailableError, RuntimeError) as error:
         advice = "NVRTC, which compiles the kernels, comes with torch; to install both again"
-        until = "until then say `--backend numba`: `auto` takes the GPU where there is one"
-        return Finding("cuda", False, (str(error), f"{advice}: {torch_with_cuda(driver())}", until))
+        return Finding("cuda", False, (str(error), f"{advice}: {torch_with_cuda(driver())}", "`auto` takes the CPU"))
     return Finding("cuda", True, ("the default, on the GPU; needs no compiler", gpu()))
 
 

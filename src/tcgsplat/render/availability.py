@@ -15,11 +15,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
+from tcgsplat.errors import BackendUnavailableError
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.protocol import Rasterizer, Splats
+from tcgsplat.render.reference import ReferenceRasterizer
 
+_DIFFERENTIATED = ("means", "quats", "scales", "opacities", "features", "pose")
+_ALIKE = 5e-3
+"""Of a norm: a hundred times what GPUs' quick exponentials and divisions do, far less than any mistake does."""
 _NO_DEVICE, _OTHER_DRIVER = 100, 803  # CUDA_ERROR_NO_DEVICE, CUDA_ERROR_SYSTEM_DRIVER_MISMATCH
 
 
@@ -177,13 +183,40 @@ def _compilers() -> tuple[str, ...]:
     return compiler_obstacles(torch.version.cuda) if torch.version.cuda else ()
 
 
-def draw_something(rasterizer: Rasterizer) -> None:
-    """One splat on one pixel, and wait for it: then all that a backend compiles or loads is there.
+def prove(rasterizer: Rasterizer) -> None:
+    """Draw a few splats, and hold the picture and its derivatives to the oracle's.
+
+    Then all that a backend compiles or loads is there, and works on this very machine.
 
     Raises:
-        BackendUnavailableError: if it cannot be.
+        BackendUnavailableError: if it cannot draw, or draws something else.
     """
-    row = torch.ones(1, 3, device=rasterizer.device)
-    ahead = row * torch.tensor([0.0, 0.0, 1.0], device=rasterizer.device)
-    splats = Splats(ahead, torch.ones(1, 4, device=rasterizer.device), 0.1 * row, 0.5 * row[:, 0], row)
-    rasterizer(splats, Camera(fx=1.0, fy=1.0, cx=0.0, cy=0.0, width=1, height=1), se3.identity()).alpha.cpu()
+    expected, found = (_derivatives(one) for one in (ReferenceRasterizer(), rasterizer))
+    for what, a, b in zip(("picture", *_DIFFERENTIATED), expected, found, strict=True):
+        apart = float((a - b).norm() / a.norm())
+        if not apart < _ALIKE:
+            raise BackendUnavailableError(
+                f"{rasterizer.name} draws wrongly on this machine ({what}: {apart:.2g} from what it should be); please "
+                "report it with what `tcgsplat doctor` prints, and use `--backend numba`"
+            )
+
+
+def _derivatives(rasterizer: Rasterizer) -> list[Tensor]:
+    """A small picture of twelve splats, and the derivatives of a sum over it, on the CPU."""
+    place = torch.linspace(0.0, 1.0, 12)
+    across, down = torch.sin(9.0 * place), torch.cos(5.0 * place)
+    values = (
+        torch.stack((0.5 * across, 0.4 * down, 1.5 + place), dim=-1),
+        torch.stack((torch.ones(12), across, down, place), dim=-1),
+        torch.stack((0.05 + 0.1 * place, 0.12 - 0.05 * place, 0.03 + 0.02 * across), dim=-1),
+        0.2 + 0.5 * place,
+        torch.stack((place, across.abs(), down.abs(), 1.0 - place), dim=-1),
+    )
+    tensors = [value.to(rasterizer.device).requires_grad_() for value in values]
+    pose = se3.exp(torch.tensor([0.02, -0.03, 0.05, 0.03, 0.02, -0.04], dtype=torch.float64)).requires_grad_()
+    with torch.enable_grad():
+        drawn = rasterizer(Splats(*tensors), Camera(fx=40.0, fy=42.0, cx=19.3, cy=14.8, width=40, height=30), pose)
+        planes = torch.stack((drawn.depth, drawn.plane_depth, drawn.alpha), dim=-1)
+        image = torch.cat((drawn.features, planes), dim=-1)
+        derivatives = torch.autograd.grad(image.square().sum(), (*tensors, pose))
+    return [tensor.detach().cpu() for tensor in (image, *derivatives)]

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from tcgsplat.errors import BackendUnavailableError
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.render.availability import draw_something, extension_obstacles, gpu_obstacles
+from tcgsplat.render.availability import extension_obstacles, gpu_obstacles, prove
 from tcgsplat.render.protocol import Raster, Splats
 from tcgsplat.render.reference import half_sizes, inverted, project, visible_footprints
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag, Plane, Pose
@@ -115,7 +115,7 @@ class GsplatRasterizer:
             raise BackendUnavailableError(f"gsplat cannot draw here: {'; '.join(obstacles)}")
         self.device = torch.empty(0, device=device).device  # with its number, as tensors have it
         try:
-            draw_something(self)
+            prove(self)
         except (ImportError, AttributeError, RuntimeError, OSError) as error:  # as many as there are ways to fail
             raise BackendUnavailableError(
                 f"gsplat's kernels cannot be compiled or loaded: {error}; `VERBOSE=1 python -c 'from gsplat.cuda."
