@@ -12,7 +12,7 @@ import torch
 from tcgsplat.confidence import equations as eq
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
-from tcgsplat.mapping.optimizer import RowAdam
+from tcgsplat.mapping.optimizer import LearningRates, RowAdam
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.losses import color_error, depth_error, isotropy_error, ssim_map
 from tcgsplat.render.protocol import Rasterizer
@@ -72,7 +72,7 @@ class AutogradOptimization:
         self._config, self._confidence, self._rasterizer = config, confidence, rasterizer
         self._submap = submap.to(rasterizer.device)
         self._before = self._submap.gaussians
-        self._adam = RowAdam(self._before, config.rates)
+        self._adam = _row_adam(self._before, config.rates)
         self._loss_value = torch.zeros(())
 
     def step(self, view: int, frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
@@ -173,6 +173,15 @@ class AutogradOptimization:
             largest=config.step_scale_max,
             p_min=config.p_min,
         )
+
+
+def _row_adam(gaussians: Gaussians, rates: LearningRates) -> RowAdam:
+    """The fastest one where these Gaussians are."""
+    if not gaussians.means.is_cuda:
+        return RowAdam(gaussians, rates)
+    from tcgsplat.mapping.cuda_optimizer import CudaRowAdam, adam_kernels  # noqa: PLC0415  a CPU needs none of it
+
+    return CudaRowAdam(gaussians, rates, adam_kernels(gaussians.means.device))
 
 
 def self_distance(after: Gaussians, before: Gaussians, config: ConfidenceConfig) -> PerGaussian:

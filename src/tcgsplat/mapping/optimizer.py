@@ -33,6 +33,8 @@ class LearningRates:
 
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
+HIGHER_HARMONICS = 0.05
+"""Of the constant one's rate. [base]"""
 
 
 @dataclass(frozen=True)
@@ -115,35 +117,49 @@ class RowAdam:
         """
         active = [name for name in PARAMETERS if name not in frozen]
         gradients = torch.autograd.grad(loss, [self._parameters[name] for name in active], allow_unused=True)
-        with torch.no_grad():
-            for name, gradient in zip(active, gradients, strict=True):
-                if gradient is None:
-                    continue
-                rows = _Rows.of(visible, gradient)
-                g = torch.nan_to_num(
-                    rows.read(gradient), nan=0.0, posinf=0.0, neginf=0.0
-                )  # one bad pixel must not end a map
-                if name in GEOMETRY and gradient_scale is not None:
-                    g = g * rows.read(gradient_scale)[:, None]
-                age = rows.read(self._steps[name]) + 1  # moments are as young as a row's first gradient
-                steps = age.view(-1, *[1] * (gradient.dim() - 1))
-                first = rows.read(self._first[name]).lerp(g, 1 - BETA_1)
-                second = BETA_2 * rows.read(self._second[name]) + (1 - BETA_2) * g * g
-                rows.write(self._steps[name], age)
-                rows.write(self._first[name], first)
-                rows.write(self._second[name], second)
-                young_1, young_2 = ((1 - beta**steps).to(g) for beta in (BETA_1, BETA_2))
-                step = first / young_1 / ((second / young_2).sqrt() + EPSILON)
-                if name in GEOMETRY and step_scale is not None:
-                    step *= rows.read(step_scale)[:, None]
-                if name == "sh":
-                    step[:, 1:] *= 0.05
-                parameters = self._parameters[name]
-                rows.write(parameters, rows.read(parameters) - pace * getattr(self._rates, name) * step)
+        for name, gradient in zip(active, gradients, strict=True):
+            if gradient is not None:
+                scales = (gradient_scale, step_scale) if name in GEOMETRY else (None, None)
+                self._advance(name, gradient, visible, pace, *scales)
+
+    @torch.no_grad()
+    def _advance(
+        self,
+        name: str,
+        gradient: Tensor,
+        visible: PerGaussianFlag | None,
+        pace: float,
+        gradient_scale: PerGaussian | None,
+        step_scale: PerGaussian | None,
+    ) -> None:
+        """One step of one table."""
+        rows = _Rows.of(visible, gradient)
+        g = torch.nan_to_num(rows.read(gradient), nan=0.0, posinf=0.0, neginf=0.0)  # one bad pixel must not end a map
+        if gradient_scale is not None:
+            g = g * rows.read(gradient_scale)[:, None]
+        age = rows.read(self._steps[name]) + 1  # moments are as young as a row's first gradient
+        steps = age.view(-1, *[1] * (gradient.dim() - 1))
+        first = rows.read(self._first[name]).lerp(g, 1 - BETA_1)
+        second = BETA_2 * rows.read(self._second[name]) + (1 - BETA_2) * g * g
+        rows.write(self._steps[name], age)
+        rows.write(self._first[name], first)
+        rows.write(self._second[name], second)
+        young_1, young_2 = ((1 - beta**steps).to(g) for beta in (BETA_1, BETA_2))
+        step = first / young_1 / ((second / young_2).sqrt() + EPSILON)
+        if step_scale is not None:
+            step *= rows.read(step_scale)[:, None]
+        if name == "sh":
+            step[:, 1:] *= HIGHER_HARMONICS
+        parameters = self._parameters[name]
+        rows.write(parameters, rows.read(parameters) - pace * getattr(self._rates, name) * step)
+
+    def _of(self, gaussians: Gaussians) -> "RowAdam":
+        """Another one of this kind."""
+        return RowAdam(gaussians, self._rates)
 
     def kept(self, keep: PerGaussianFlag) -> "RowAdam":
         """The optimiser of the flagged rows only, moments included."""
-        smaller = RowAdam(self.detached().kept(keep), self._rates)
+        smaller = self._of(self.detached().kept(keep))
         smaller._first = {name: moment[keep] for name, moment in self._first.items()}
         smaller._second = {name: moment[keep] for name, moment in self._second.items()}
         smaller._steps = {name: steps[keep] for name, steps in self._steps.items()}

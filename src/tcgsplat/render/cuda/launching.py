@@ -30,11 +30,10 @@ _ELEMENTS = MappingProxyType(
 _FIELD = re.compile(r"(?:const )?(float|int|long long|unsigned char|[A-Z]\w*)(\*?) ([\w, ]+);")
 
 
-def source(constants: Mapping[str, str], *names: str) -> str:
-    """The text of kernels: constants, then files of this folder, one after the other."""
+def source(constants: Mapping[str, str], *paths: str) -> str:
+    """The text of kernels: constants, then files of the package, one after the other."""
     defined = "".join(f"#define {name} {value}\n" for name, value in constants.items())
-    here = files("tcgsplat.render.cuda")
-    return defined + "\n".join(here.joinpath(name).read_text() for name in names)
+    return defined + "\n".join(files("tcgsplat").joinpath(path).read_text() for path in paths)
 
 
 @runtime_checkable
@@ -47,7 +46,7 @@ class Kernels(Protocol):
         Args:
             name: As in its text.
             blocks: At least 1.
-            arguments: By the names of its struct: tensors for pointers, numbers, and mappings for structs in it.
+            arguments: By the names of its struct: tensors for pointers, or None; numbers; mappings for structs in it.
         """
         ...
 
@@ -76,11 +75,11 @@ class Signatures:
         filled = self._structure(struct)()
         for name, kind, pointer in fields:
             value = values[name]
-            if pointer:
+            if pointer and value is not None:
                 if value.dtype != _ELEMENTS[kind] or not value.is_contiguous():
                     raise TypeError(f"{struct}.{name} is {value.dtype}, not {_ELEMENTS[kind]} side by side")
                 value = value.data_ptr()
-            elif kind not in _SIZES:
+            elif not pointer and kind not in _SIZES:
                 value = self._filled(kind, value)
             setattr(filled, name, value)
         return filled

@@ -28,7 +28,7 @@ def kernel_text(features: int) -> str:
     """All kernels as C++, for so many feature channels."""
     constants = {name: f"{getattr(protocol, name)!r}f" for name in _CONSTANTS}
     constants |= {"LOG2_E": "1.4426950408889634f", "FEATURES": str(features), "SUMS": str(_sums(features))}
-    return source(constants, "kernel.cuh", "projection.cu", "blending.cu")
+    return source(constants, *(f"render/cuda/{name}" for name in ("kernel.cuh", "projection.cu", "blending.cu")))
 
 
 def _sums(features: int) -> int:

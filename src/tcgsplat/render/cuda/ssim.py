@@ -14,7 +14,11 @@ from tcgsplat.tensors import Image
 
 def ssim_text(radius: int, c1: float, c2: float) -> str:
     """The kernels as C++, for a window of so many pixels to each side and with SSIM's constants."""
-    return source({"RADIUS": str(radius), "SSIM_C1": f"{c1!r}f", "SSIM_C2": f"{c2!r}f"}, "kernel.cuh", "ssim.cu")
+    return source(
+        {"RADIUS": str(radius), "SSIM_C1": f"{c1!r}f", "SSIM_C2": f"{c2!r}f"},
+        "render/cuda/kernel.cuh",
+        "render/cuda/ssim.cu",
+    )
 
 
 @cache
