@@ -398,6 +398,7 @@ def test_without_a_sealed_submap_a_run_begins_anew(
             "has other settings: mapper.iterations was 10 and is 7; seed was 0 and is 9; resume it with the same ones",
         ),
         (["--preset", "paper-tum"], "has other settings: "),
+        (["--backend", "reference"], "was drawn by numba, and reference has other bits; add --backend numba"),
     ],
 )
 def test_another_run_is_not_resumed(

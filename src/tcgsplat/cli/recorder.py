@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -52,11 +53,6 @@ class Part:
         """
         return open_sequence(folder, start=self.start, stride=self.stride, limit=self.limit)
 
-    @property
-    def request(self) -> str:
-        """As `request.json` has it, with the command line for people."""
-        return json.dumps({"command": shlex.join(["tcgsplat", *sys.argv[1:]]), **asdict(self)}, indent=2) + "\n"
-
     @staticmethod
     def of(run: RunDirectory) -> "Part":
         """That of a run; the whole sequence where the run does not say.
@@ -64,21 +60,32 @@ class Part:
         Raises:
             ArchiveError: if `request.json` is there and makes no sense.
         """
-        path = run.path / "request.json"
-        if not path.exists():
-            return Part()
+        request = _request(run)
         try:
-            request = json.loads(path.read_text(encoding="utf-8"))
-            return Part(request["start"], request["stride"], request["limit"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ArchiveError(f"cannot read {path} ({error}); run again") from error
+            return Part() if request is None else Part(request["start"], request["stride"], request["limit"])
+        except (KeyError, TypeError) as error:
+            raise ArchiveError(f"cannot read {run.path / 'request.json'} ({error}); run again") from error
 
 
-def resume(path: Path, config: SlamConfig, folder: Path, part: Part) -> RunDirectory:
+def _request(run: RunDirectory) -> dict[str, Any] | None:
+    """What was asked for; None where the run does not say."""
+    path = run.path / "request.json"
+    if not path.exists():
+        return None
+    try:
+        request = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ArchiveError(f"cannot read {path} ({error}); run again") from error
+    if not isinstance(request, dict):
+        raise ArchiveError(f"cannot read {path} (it is no object); run again")
+    return request
+
+
+def resume(path: Path, config: SlamConfig, folder: Path, part: Part, *, backend: str = "") -> RunDirectory:
     """The run directory of the same run, which was interrupted.
 
     Raises:
-        ArchiveError: if the run that is there has other settings or other data, or has ended.
+        ArchiveError: if the run that is there has other settings, other data or another rasterizer, or has ended.
     """
     run = RunDirectory.open(path)
     if run.summary() and not run.summary().get("interrupted"):
@@ -89,14 +96,20 @@ def resume(path: Path, config: SlamConfig, folder: Path, part: Part) -> RunDirec
     other = [f"{name} was {then[name]} and is {now[name]}" for name in now if now[name] != then[name]]
     if other:
         raise ArchiveError(f"the run in {path} has other settings: {'; '.join(other)}; resume it with the same ones")
+    if backend != (drawn := (_request(run) or {}).get("backend") or backend):
+        raise ArchiveError(
+            f"the run in {path} was drawn by {drawn}, and {backend} has other bits; add --backend {drawn}"
+        )
     outdated = (path / name for name in ("summary.json", "map.npz", "report.json", "localized.txt"))
     for file in (*outdated, *path.rglob(atomic.PARTIAL)):
         file.unlink(missing_ok=True)
     return run
 
 
-def begin(path: Path, config: SlamConfig, folder: Path, part: Part, *, overwrite: bool) -> RunDirectory:
-    """A new run directory that knows its settings and its data.
+def begin(
+    path: Path, config: SlamConfig, folder: Path, part: Part, *, overwrite: bool, backend: str = ""
+) -> RunDirectory:
+    """A new run directory that knows its settings and its data, and the rasterizer if that is told.
 
     Raises:
         ArchiveError: if there is something at `path` already that may not be, or cannot be, replaced.
@@ -105,8 +118,9 @@ def begin(path: Path, config: SlamConfig, folder: Path, part: Part, *, overwrite
         if not overwrite:
             raise ArchiveError(f"{path} exists; choose another folder by --out, or replace the run by --overwrite")
         shutil.rmtree(RunDirectory.open(path).path)  # `open` refuses a folder that holds no run
-    data = str(folder.expanduser().resolve())
-    return RunDirectory.create(path, config_toml=to_toml(config), sequence=data, request=part.request)
+    data, command = str(folder.expanduser().resolve()), shlex.join(["tcgsplat", *sys.argv[1:]])
+    request = json.dumps({"command": command, "backend": backend, **asdict(part)}, indent=2) + "\n"
+    return RunDirectory.create(path, config_toml=to_toml(config), sequence=data, request=request)
 
 
 def recorded(

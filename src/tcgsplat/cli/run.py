@@ -72,9 +72,9 @@ def command(args: Args) -> int:
     say(f"drawing with {rasterizer.name} on {rasterizer.device}")
     out = args.out or Path("runs") / sequence.name
     if args.resume and (out / "run.json").exists():
-        run = resume(out, config, args.folder, part)
+        run = resume(out, config, args.folder, part, backend=rasterizer.name)
     else:
-        run = begin(out, config, args.folder, part, overwrite=args.overwrite)
+        run = begin(out, config, args.folder, part, overwrite=args.overwrite, backend=rasterizer.name)
     summary = recorded(sequence, config, rasterizer, run, args.preset, realtime=args.realtime)
     if summary.interrupted:
         sys.stderr.write(f"tcgsplat: stopped; saved {summary}: {run.path}\n")
