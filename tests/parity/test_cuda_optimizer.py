@@ -1,7 +1,5 @@
 """Adam by the GPU's kernel, emulated on the CPU, against Adam by torch."""
 
-from pathlib import Path
-
 import pytest
 import torch
 from emulated_cuda import COMPILER, EmulatedKernels
@@ -9,9 +7,13 @@ from emulated_cuda import COMPILER, EmulatedKernels
 from tcgsplat.errors import BackendUnavailableError
 from tcgsplat.mapping.cuda_optimizer import CudaRowAdam, adam_text
 from tcgsplat.mapping.optimizer import PARAMETERS, LearningRates, RowAdam
-from tcgsplat.render.cuda.launching import compiled, nvrtc_library
+from tcgsplat.render.cuda.launching import Compiled, Kernels, compiled, nvrtc_library
 from tcgsplat.scene.gaussians import Gaussians
 
+EMULATED = pytest.param(
+    "emulated", marks=pytest.mark.skipif(COMPILER is None, reason="no C++ compiler to emulate with")
+)
+REAL = pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU"))
 N = 300  # more than a block's threads
 
 
@@ -35,27 +37,33 @@ def loss_of(current: Gaussians, step: int) -> torch.Tensor:
     return each.sum() + (torch.sqrt(current.means[7, 0] * 0.0) * 0.0 if step == 2 else 0.0)
 
 
-@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler to emulate with")
+@pytest.fixture(scope="module", params=[EMULATED, REAL])
+def place(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Kernels, torch.device]:
+    if request.param == "emulated":
+        return EmulatedKernels(adam_text(), tmp_path_factory.mktemp("emulated")), torch.device("cpu")
+    return Compiled(adam_text(), torch.device("cuda", 0)), torch.device("cuda", 0)
+
+
 @pytest.mark.parametrize("sh_degree", [0, 1])
 @pytest.mark.parametrize("literal", [False, True])
-def test_steps_are_those_of_torch(tmp_path: Path, sh_degree: int, literal: bool) -> None:
-    rates, kernels = LearningRates(), EmulatedKernels(adam_text(), tmp_path)
+def test_steps_are_those_of_torch(place: tuple[Kernels, torch.device], sh_degree: int, literal: bool) -> None:
+    rates, (kernels, device) = LearningRates(), place
     start = gaussians(sh_degree)
-    adams = [RowAdam(start, rates), CudaRowAdam(start, rates, kernels)]
+    adams = [RowAdam(start, rates), CudaRowAdam(start.to(device), rates, kernels)]
     g = torch.Generator().manual_seed(2)
     scale = 0.5 + torch.rand(N, generator=g)
     for step in range(8):
         visible = None if step == 5 else torch.rand(N, generator=g) < 0.7
-        options = {"gradient_scale": scale} if literal else {"step_scale": scale}
-        for adam in adams:
-            frozen = ("sh",) if step < 3 else ()
-            adam.step(loss_of(adam.gaussians, step), visible=visible, frozen=frozen, pace=1.0 - 0.05 * step, **options)
+        for adam, there in zip(adams, (torch.device("cpu"), device), strict=True):
+            options = {"gradient_scale": scale.to(there)} if literal else {"step_scale": scale.to(there)}
+            frozen, seen = ("sh",) if step < 3 else (), None if visible is None else visible.to(there)
+            adam.step(loss_of(adam.gaussians, step), visible=seen, frozen=frozen, pace=1.0 - 0.05 * step, **options)
     keep = torch.rand(N, generator=g) < 0.9
-    adams = [adam.kept(keep) for adam in adams]
+    adams = [adams[0].kept(keep), adams[1].kept(keep.to(device))]
     for step in range(3):
-        for adam in adams:
-            adam.step(loss_of(adam.gaussians, step), step_scale=None if literal else scale[keep])
-    theirs, ours = (adam.detached() for adam in adams)
+        for adam, there in zip(adams, (torch.device("cpu"), device), strict=True):
+            adam.step(loss_of(adam.gaussians, step), step_scale=None if literal else scale[keep].to(there))
+    theirs, ours = (adam.detached().cpu() for adam in adams)
     first = start.kept(keep)
     for name in PARAMETERS:
         a, b, before = (getattr(x, name) for x in (theirs, ours, first))
@@ -64,9 +72,9 @@ def test_steps_are_those_of_torch(tmp_path: Path, sh_degree: int, literal: bool)
         assert (a - b).abs().max() < 2e-5 * (a - before).abs().max() + rounding, name
 
 
-@pytest.mark.skipif(COMPILER is None, reason="no C++ compiler to emulate with")
-def test_nothing_to_step(tmp_path: Path) -> None:
-    adam = CudaRowAdam(Gaussians.empty(), LearningRates(), EmulatedKernels(adam_text(), tmp_path))
+def test_nothing_to_step(place: tuple[Kernels, torch.device]) -> None:
+    kernels, device = place
+    adam = CudaRowAdam(Gaussians.empty(device=device), LearningRates(), kernels)
     adam.step(sum(getattr(adam.gaussians, name).sum() for name in PARAMETERS))  # type: ignore[arg-type]
     assert len(adam.detached()) == 0
 

@@ -25,20 +25,24 @@ from tcgsplat.tracking import alignment_kernels as kernels
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
 
-_ENOUGH_FOR_EXPOSURE = 100.0
+ENOUGH_FOR_EXPOSURE = 100.0
 """Sum of weights below which gain and offset are left alone: about as many points."""
-_MAX_GAIN = 2.5
+MAX_GAIN = 2.5
 """Of a picture over its submap's first, and its inverse: two to three stops, since colours are not linear in light."""
-_FLAT_VARIANCE = 0.002
+FLAT_VARIANCE = 0.002
 """Variance of intensity, grey levels squared, that a gain of 1 is worth: an image flatter than that keeps it."""
 _COARSEST = 80
 """Pixels across the coarsest level, at most: a pixel there is most of a degree, what a fast hand turns in a frame."""
-_SPARSE = 200
+SPARSE = 200
 """Pixels across from which on a level is sampled by `stride`: above it, neighbours say nearly the same."""
-_SOLID = 0.95
+SOLID = 0.95
 """Alpha from which on a pixel tells the exposure."""
-_STEP_PRIOR = 0.05
+STEP_PRIOR = 0.05
 """Spread of a step that is expected before anything is seen, metres and radians."""
+SMALL = 3e-4
+"""Steps, metres and radians, from which on a coarse level has done what it can."""
+COLOR_SCALE, DEPTH_SCALE = 0.05, 2.0
+"""Spreads of the residuals before anything is known: grey levels, and of the depth noise that is expected."""
 _LOW, _HIGH = np.sort(np.indices((6, 6)), axis=0)
 _HESSIAN_ENTRY = kernels.HESSIAN + 6 * _LOW - _LOW * (_LOW - 1) // 2 + _HIGH - _LOW
 """Where each entry of the symmetric H is among the sums."""
@@ -130,7 +134,7 @@ class _Level:
     """Metres, times (1 + z/2)."""
 
 
-def _passes(config: AlignmentConfig, camera: Camera) -> tuple[int, ...]:
+def passes_of_levels(config: AlignmentConfig, camera: Camera) -> tuple[int, ...]:
     """Passes a level, finest first; large images get more coarse levels, so that a step spans as much of any image."""
     more = max(math.ceil(math.log2(camera.width / _COARSEST)) + 1 - len(config.iterations), 0)
     return (*config.iterations, *[config.iterations[-1]] * more)
@@ -147,12 +151,12 @@ def _levels(frame: Frame, rendering: Rendering, weight: Plane, config: Alignment
     intensity, depth = kernels.rendered_view(
         rendering.color.numpy(), rendering.composited_plane_depth.numpy(), alpha, np.float32(config.min_alpha)
     )
-    composited, solid = luma(rendering.color), np.where(alpha > _SOLID, depth, np.float32(-1))
+    composited, solid = luma(rendering.color), np.where(alpha > SOLID, depth, np.float32(-1))
     solid_points: Floats = np.empty((0, 0), np.float32)
     weights = np.ascontiguousarray(weight.numpy())
     live, live_depth = kernels.live_view(frame.color.numpy(), frame.depth.numpy(), frame.valid.numpy())
     camera, levels = frame.camera, list[_Level]()
-    for number, passes in enumerate(_passes(config, camera)):
+    for number, passes in enumerate(passes_of_levels(config, camera)):
         if number:
             intensity, weights, live = (kernels.halved_intensity(image) for image in (intensity, weights, live))
             depth, live_depth = kernels.halved_depth(depth), kernels.halved_depth(live_depth)
@@ -161,7 +165,7 @@ def _levels(frame: Frame, rendering: Rendering, weight: Plane, config: Alignment
             camera = camera.scaled(0.5)
         if passes:
             intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-            sampling = (2, config.stride) if camera.width > _SPARSE else (1, 1)
+            sampling = (2, config.stride) if camera.width > SPARSE else (1, 1)
             gate = 2 * config.gate if number else config.gate
             points = kernels.reference_points(intensity, depth, weights, intrinsics, *sampling)
             if not levels:
@@ -171,13 +175,13 @@ def _levels(frame: Frame, rendering: Rendering, weight: Plane, config: Alignment
 
 
 @dataclass
-class _Photometry:
+class Photometry:
     """Nuisance parameters that are re-estimated at every pass."""
 
     gain: float = 1.0
     offset: float = 0.0
-    color_scale: float = 0.05
-    depth_scale: float = 2.0
+    color_scale: float = COLOR_SCALE
+    depth_scale: float = DEPTH_SCALE
 
     def refit(self, sums: Doubles) -> None:
         """Exposure from weighted moments (a prior of small variance keeps flat images at gain 1), spreads from rms."""
@@ -186,11 +190,11 @@ class _Photometry:
         if sums[kernels.DEPTH_WEIGHT] > 0:
             self.depth_scale = max(0.05, float(sums[kernels.DEPTH_SQUARES] / sums[kernels.DEPTH_WEIGHT]) ** 0.5)
         total = float(sums[kernels.GAIN_W])
-        if total > _ENOUGH_FOR_EXPOSURE:
+        if total > ENOUGH_FOR_EXPOSURE:
             reference, live = float(sums[kernels.GAIN_R]) / total, float(sums[kernels.GAIN_L]) / total
             variance = float(sums[kernels.GAIN_RR]) / total - reference**2
             covariance = float(sums[kernels.GAIN_RL]) / total - reference * live
-            self.gain = min(_MAX_GAIN, max(1 / _MAX_GAIN, (covariance + _FLAT_VARIANCE) / (variance + _FLAT_VARIANCE)))
+            self.gain = min(MAX_GAIN, max(1 / MAX_GAIN, (covariance + FLAT_VARIANCE) / (variance + FLAT_VARIANCE)))
             self.offset = live - self.gain * reference
 
 
@@ -205,7 +209,7 @@ def correlation(weight: float, x: float, y: float, xx: float, xy: float, yy: flo
     return (xy / total - mean_x * mean_y + prior) / math.sqrt(variance_x * variance_y)
 
 
-def _constants(level: _Level, T: Doubles, photometry: _Photometry, config: AlignmentConfig) -> Floats:
+def _constants(level: _Level, T: Doubles, photometry: Photometry, config: AlignmentConfig) -> Floats:
     """Of one pass, in the kernel's order."""
     constants = np.empty(kernels.CONSTANTS, np.float32)
     constants[kernels.ROTATION : kernels.TRANSLATION] = T[:3, :3].ravel()
@@ -218,24 +222,14 @@ def _constants(level: _Level, T: Doubles, photometry: _Photometry, config: Align
     return constants
 
 
-def _exposure(level: _Level, T: Doubles, photometry: _Photometry, config: AlignmentConfig) -> Exposure:
-    """What a level's points tell at the pose that was found."""
-    found = replace(photometry)
-    found.refit(kernels.normal_equations(level.points, level.live, _constants(level, T, photometry, config)))
-    return Exposure(found.gain, found.offset)
+def _sums(level: _Level, T: Doubles, photometry: Photometry, config: AlignmentConfig) -> Doubles:
+    """Of a pass over a level."""
+    sums: Doubles = kernels.normal_equations(level.points, level.live, _constants(level, T, photometry, config))
+    return sums
 
 
-def _separated(level: _Level, T: Doubles, photometry: _Photometry, config: AlignmentConfig) -> list[Equations]:
-    """Normal equations of colour alone and of depth alone."""
-    color, both = (
-        kernels.normal_equations(
-            level.points, level.live, _constants(level, T, photometry, replace(config, depth_weight=weight))
-        )
-        for weight in (0.0, 1.0)
-    )
-    return [
-        Equations(sums[_HESSIAN_ENTRY], sums[kernels.GRADIENT : kernels.GRADIENT + 6]) for sums in (color, both - color)
-    ]
+def _equations(sums: Doubles) -> Equations:
+    return Equations(sums[_HESSIAN_ENTRY], sums[kernels.GRADIENT : kernels.GRADIENT + 6])
 
 
 def _step(sums: Doubles) -> Doubles:
@@ -243,7 +237,7 @@ def _step(sums: Doubles) -> Doubles:
 
     Beside thousands of residuals that is nothing, but what they leave open (a flat wall, a coarse level) stays put.
     """
-    H, g = sums[_HESSIAN_ENTRY] + np.eye(6) / _STEP_PRIOR**2, sums[kernels.GRADIENT : kernels.GRADIENT + 6]
+    H, g = sums[_HESSIAN_ENTRY] + np.eye(6) / STEP_PRIOR**2, sums[kernels.GRADIENT : kernels.GRADIENT + 6]
     return -np.asarray(np.linalg.solve(H, g), np.float64)
 
 
@@ -273,29 +267,67 @@ def align(frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, co
     levels, solid_points = _levels(frame, rendering, weight, config)
     finest = levels[0]
     T = np.eye(4)  # reference camera to live camera
-    photometry, sums, passes = _Photometry(), np.zeros(kernels.SUMS), 0
+    photometry, sums, passes = Photometry(), np.zeros(kernels.SUMS), 0
     for level in reversed(levels):
-        photometry.color_scale, photometry.depth_scale = 0.05, 2.0
+        photometry.color_scale, photometry.depth_scale = COLOR_SCALE, DEPTH_SCALE
         for _ in range(level.passes):
-            sums = kernels.normal_equations(level.points, level.live, _constants(level, T, photometry, config))
+            sums = _sums(level, T, photometry, config)
             photometry.refit(sums)
             step = _step(sums)
             T = _exp(step) @ T
             passes += 1
-            if np.linalg.norm(step[:3]) < 3e-4 and np.linalg.norm(step[3:]) < 3e-4 and level is not finest:
+            if np.linalg.norm(step[:3]) < SMALL and np.linalg.norm(step[3:]) < SMALL and level is not finest:
                 break
-    readings = float(sums[kernels.READINGS])
-    color, depth = _separated(finest, T, photometry, config)
+    return concluded(
+        T_map_ref,
+        T,
+        passes,
+        photometry,
+        points=int(np.count_nonzero(finest.points[kernels.PZ])),
+        last=sums,
+        color=_sums(finest, T, photometry, replace(config, depth_weight=0.0)),
+        both=_sums(finest, T, photometry, replace(config, depth_weight=1.0)),
+        solid=_sums(replace(finest, points=solid_points), T, photometry, config),
+    )
+
+
+def concluded(
+    T_map_ref: Pose,
+    T_live_ref: Doubles,
+    passes: int,
+    photometry: Photometry,
+    *,
+    points: int,
+    last: Doubles,
+    color: Doubles,
+    both: Doubles,
+    solid: Doubles,
+) -> Alignment:
+    """What the solver found, from the sums of its last passes.
+
+    Args:
+        T_map_ref: Pose of the rendered view.
+        T_live_ref: What was found: reference camera to live camera.
+        passes: How many it took.
+        photometry: As it was found.
+        points: Of the finest level.
+        last: Sums of the last pass that moved the pose.
+        color: Of the finest level at the pose that was found, without depth's residuals.
+        both: The same with them, at full weight.
+        solid: Of the points that tell the exposure, there.
+    """
+    readings, exposed = float(last[kernels.READINGS]), replace(photometry)
+    exposed.refit(solid)
     return Alignment(
-        T_map_cam=T_map_ref @ se3.inverse(torch.from_numpy(T)),
+        T_map_cam=T_map_ref @ se3.inverse(torch.from_numpy(T_live_ref)),
         iterations=passes,
-        overlap=float(sums[kernels.IN_VIEW]) / max(int(np.count_nonzero(finest.points[kernels.PZ])), 1),
-        agreement=float(sums[kernels.AGREEING]) / readings if readings else 1.0,
+        overlap=float(last[kernels.IN_VIEW]) / max(points, 1),
+        agreement=float(last[kernels.AGREEING]) / readings if readings else 1.0,
         correlation=correlation(
-            *(float(sums[k]) for k in (kernels.GAIN_W, kernels.GAIN_R, kernels.GAIN_L)),
-            *(float(sums[k]) for k in (kernels.GAIN_RR, kernels.GAIN_RL, kernels.GAIN_LL)),
+            *(float(last[k]) for k in (kernels.GAIN_W, kernels.GAIN_R, kernels.GAIN_L)),
+            *(float(last[k]) for k in (kernels.GAIN_RR, kernels.GAIN_RL, kernels.GAIN_LL)),
         ),
-        exposure=_exposure(replace(finest, points=solid_points), T, photometry, config),
-        color=color,
-        depth=depth,
+        exposure=Exposure(exposed.gain, exposed.offset),
+        color=_equations(color),
+        depth=_equations(both - color),
     )

@@ -63,11 +63,11 @@ FACING = np.float32(0.2)
 _CHUNK = 64
 """Vectors of points that are summed in float32 before the sums go to float64."""
 _ZERO, _QUARTER, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.25), np.float32(0.5), np.float32(1), np.float32(2)
-_TINY = np.float32(1e-9)
+TINY = np.float32(1e-9)
 """Metres; anything above it is a reading."""
-_THIN = np.float32(1e-3)
+THIN = np.float32(1e-3)
 """Coverage that is not divided by any more."""
-_BASE = np.float32(0.4)
+BASE = np.float32(0.4)
 """Distance of the least depth noise, metres."""
 _RED, _GREEN, _BLUE = np.float32(0.299), np.float32(0.587), np.float32(0.114)
 
@@ -104,7 +104,7 @@ def rendered_view(color, depth, alpha, min_alpha):
     intensity, marked = luma(color), np.empty((h, w), np.float32)
     for y in range(h):
         for x in range(w):
-            inverse = _ONE / max(alpha[y, x], _THIN)
+            inverse = _ONE / max(alpha[y, x], THIN)
             intensity[y, x] *= inverse
             marked[y, x] = depth[y, x] * inverse if alpha[y, x] > min_alpha else -_ONE
     return intensity, marked
@@ -195,7 +195,7 @@ def reference_points(intensity, depth, weight, intrinsics, radius, stride):
             x = load(columns, 0) + np.float32(k * LANES * stride)
             at = minimum(x, last)
             d = gather(depth, row, at)
-            d = where_ge(d, spread(_TINY), where_ge(last, x, d, zero), zero)
+            d = where_ge(d, spread(TINY), where_ge(last, x, d, zero), zero)
             left, right = gather(depth, row - radius, at), gather(depth, row + radius, at)
             up, down = gather(depth, row - radius * w, at), gather(depth, row + radius * w, at)
             a = (at - center_x) / focal_x
@@ -274,7 +274,7 @@ def normal_equations(points, live, constants):
     color_precision = _ONE / (constants[COLOR_SCALE] * constants[COLOR_SCALE])
     depth_precision = _ONE / (constants[DEPTH_SCALE] * constants[DEPTH_SCALE])
     balance = constants[BALANCE]
-    zero, one, half, tiny, near = spread(_ZERO), spread(_ONE), spread(_HALF), spread(_TINY), spread(NEAREST)
+    zero, one, half, tiny, near = spread(_ZERO), spread(_ONE), spread(_HALF), spread(TINY), spread(NEAREST)
     end_u, end_v = spread(np.float32(w - 2)), spread(np.float32(h - 2))
     totals, sums = np.zeros(SUMS), np.empty(SUMS * LANES, np.float32)
     for start in range(0, n, _CHUNK * LANES):
@@ -324,7 +324,7 @@ def normal_equations(points, live, constants):
             facing = (nx * X + ny * Y + nz * Z) * iz
             faces = where_ge(maximum(facing, zero - facing), spread(FACING), one, zero)
             scale = where_ge(faces, half, _ONE / facing, zero)
-            past = d - _BASE
+            past = d - BASE
             sigma = past * past * sigma_slope + sigma_floor
             precision = _ONE / (sigma * sigma)
             depth_square = behind * behind * precision

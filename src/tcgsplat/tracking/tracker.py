@@ -20,7 +20,7 @@ from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.alignment import AlignmentConfig, Equations, align, correlation, luma
+from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, Equations, align, correlation, luma
 from tcgsplat.tracking.descent import DescentConfig, descend
 
 
@@ -130,12 +130,7 @@ class Tracker:
             rendering = render_view(submap, frame.camera, found.T_map_cam, self._rasterizer)
             compared = _compared(rendering, frame, self._config.alignment.gate)
             return self._believed(guess, Tracked(found.T_map_cam, "", found.iterations, *compared))
-        frame, rendering = frame.cpu(), self._view_of(submap)(frame.camera, guess).cpu()  # where the solver is
-        if self._floor is None:
-            weight = torch.ones_like(rendering.confidence)
-        else:
-            weight = eq.tracking_weight(rendering.confidence, floor=self._floor)
-        aligned = align(frame, rendering, weight, guess, self._config.alignment)
+        aligned = self._aligned(frame, self._view_of(submap)(frame.camera, guess), guess)
         tracked = Tracked(
             aligned.T_map_cam,
             iterations=aligned.iterations,
@@ -147,6 +142,21 @@ class Tracker:
             depth=aligned.depth,
         )
         return self._believed(guess, tracked)
+
+    def _aligned(self, frame: Frame, rendering: Rendering, guess: Pose) -> Alignment:
+        """By the solver where the rendering is, if it is on a GPU, else on the CPU."""
+        if not rendering.alpha.is_cuda:
+            frame, rendering = frame.cpu(), rendering.cpu()
+        if self._floor is None:
+            weight = torch.ones_like(rendering.confidence)
+        else:
+            weight = eq.tracking_weight(rendering.confidence, floor=self._floor)
+        if not rendering.alpha.is_cuda:
+            return align(frame, rendering, weight, guess, self._config.alignment)
+        from tcgsplat.tracking import cuda_alignment  # noqa: PLC0415  a CPU needs none of it
+
+        kernels, frame = cuda_alignment.alignment_kernels(rendering.alpha.device), frame.to(rendering.alpha.device)
+        return cuda_alignment.align(kernels, frame, rendering, weight, guess, self._config.alignment)
 
     def _view_of(self, submap: Submap) -> SubmapView:
         """Frame after frame is tracked against one submap."""

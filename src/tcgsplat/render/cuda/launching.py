@@ -25,9 +25,15 @@ THREADS = 256
 """Of a block, always."""
 _SIZES = MappingProxyType({"float": ctypes.c_float, "int": ctypes.c_int, "long long": ctypes.c_longlong})
 _ELEMENTS = MappingProxyType(
-    {"float": torch.float32, "int": torch.int32, "long long": torch.int64, "unsigned char": torch.bool}
+    {
+        "float": torch.float32,
+        "double": torch.float64,
+        "int": torch.int32,
+        "long long": torch.int64,
+        "unsigned char": torch.bool,
+    }
 )
-_FIELD = re.compile(r"(?:const )?(float|int|long long|unsigned char|[A-Z]\w*)(\*?) ([\w, ]+);")
+_FIELD = re.compile(r"(?:const )?(float|double|int|long long|unsigned char|[A-Z]\w*)(\*?) ([\w, ]+);")
 
 
 def source(constants: Mapping[str, str], *paths: str) -> str:

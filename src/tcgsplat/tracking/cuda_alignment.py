@@ -1,0 +1,203 @@
+"""Direct alignment on a GPU: the solver of alignment.py, whose passes follow one another without being waited for."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.cuda.launching import THREADS, Compiled, Kernels, source
+from tcgsplat.render.view import Rendering
+from tcgsplat.scene.frame import Frame
+from tcgsplat.tensors import Plane, Pose
+from tcgsplat.tracking import alignment as cpu
+from tcgsplat.tracking import alignment_kernels as cpu_kernels
+from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, Photometry, concluded, passes_of_levels
+
+_POSE, _GAIN, _COLOR_SCALE, _DONE, _PASSES, _STATE = 0, 16, 18, 20, 21, 22  # as in the kernels' text
+_PADDED = 48
+
+
+def alignment_text() -> str:
+    """The kernels as C++."""
+    shared = ("THIN", "SMOOTH", "TINY", "NEAREST", "FACING", "BASE", "STUDENT_DOF")
+    solver = ("ENOUGH_FOR_EXPOSURE", "FLAT_VARIANCE", "MAX_GAIN", "STEP_PRIOR", "SMALL")
+    constants = {name: f"{float(getattr(cpu_kernels, name))!r}f" for name in shared}
+    constants |= {"SOLID": f"{cpu.SOLID!r}f"} | {name: repr(getattr(cpu, name)) for name in solver}
+    return source(constants, "render/cuda/kernel.cuh", "tracking/alignment.cu")
+
+
+@cache
+def alignment_kernels(device: torch.device) -> Kernels:
+    """Compiled for a GPU."""
+    return Compiled(alignment_text(), device)
+
+
+@cache
+def _start(device: torch.device) -> Tensor:
+    """The state before the first pass."""
+    photometry = Photometry()
+    rest = [photometry.gain, photometry.offset, photometry.color_scale, photometry.depth_scale, 0.0, 0.0]
+    return torch.cat((torch.eye(4, dtype=torch.float64).flatten(), torch.tensor(rest, dtype=torch.float64))).to(device)
+
+
+@dataclass(frozen=True)
+class _Level:
+    """Both views at one resolution."""
+
+    passes: int
+    points: Tensor
+    """Of the rendered view, [POINT, n]."""
+    live: Tensor
+    """Of the frame, [h, w, CHANNELS]."""
+    camera: Camera
+    gate: float
+
+
+class _Images:
+    """The launches, by name."""
+
+    def __init__(self, kernels: Kernels) -> None:
+        self._kernels = kernels
+
+    def rendered(self, rendering: Rendering, min_alpha: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Intensity and depth; the same as drawn, and where the map is opaque."""
+        out = tuple(torch.empty_like(rendering.alpha) for _ in range(4))
+        self._each(rendering.alpha.numel(), "rendered_view", {
+            "color": rendering.color.permute(2, 0, 1).contiguous(), "alpha": rendering.alpha.contiguous(),
+            "plane_depth": rendering.composited_plane_depth.contiguous(), "min_alpha": min_alpha,
+            "intensity": out[0], "depth": out[1], "composited": out[2], "solid": out[3],
+            "pixels": rendering.alpha.numel(),
+        })  # fmt: skip
+        return out  # type: ignore[return-value]
+
+    def live(self, frame: Frame) -> tuple[Tensor, Tensor]:
+        """Intensity and depth."""
+        intensity, depth = torch.empty_like(frame.depth), torch.empty_like(frame.depth)
+        self._each(depth.numel(), "live_view", {
+            "color": frame.color.contiguous(), "measured": frame.depth.contiguous(), "valid": frame.valid.contiguous(),
+            "intensity": intensity, "depth": depth, "pixels": depth.numel(),
+        })  # fmt: skip
+        return intensity, depth
+
+    def halved(self, kind: str, image: Tensor) -> Tensor:
+        """Half as wide and high; `kind` is intensity or depth."""
+        (height, width), pitch = (side // 2 for side in image.shape), image.shape[1]
+        half = image.new_empty(height, width)
+        given = {"image": image, "half": half, "width": width, "height": height, "pitch": pitch}
+        self._each(half.numel(), f"halve_{kind}", given)
+        return half
+
+    def sampled(self, intensity: Tensor, depth: Tensor) -> Tensor:
+        """What a pass samples."""
+        height, width = depth.shape
+        image = depth.new_empty(height, width, cpu_kernels.CHANNELS)
+        given = {"intensity": intensity, "depth": depth, "image": image, "width": width, "height": height}
+        self._each(depth.numel(), "live_image", given)
+        return image
+
+    def points(
+        self, intensity: Tensor, depth: Tensor, weight: Tensor, camera: Camera, radius: int, stride: int
+    ) -> Tensor:
+        """Of a rendered view."""
+        height, width = depth.shape
+        columns, rows = len(range(2, width - 2, stride)), len(range(2, height - 2, stride))
+        points = depth.new_empty(cpu_kernels.POINT, columns * rows)
+        self._each(columns * rows, "reference_points", {
+            "intensity": intensity, "depth": depth, "weight": weight, "points": points, "width": width,
+            "columns": columns, "n": columns * rows, "radius": radius, "stride": stride, "fx": camera.fx,
+            "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+        })  # fmt: skip
+        return points
+
+    def passed(
+        self, level: _Level, state: Tensor, config: AlignmentConfig, *, balance: float, moves: bool, finest: bool
+    ) -> Tensor:
+        """The sums of a pass [SUMS], after which the state follows if it moves."""
+        n, (height, width, _) = level.points.shape[1], level.live.shape
+        blocks, camera = max(-(-n // THREADS), 1), level.camera
+        partial = level.points.new_empty(blocks, _PADDED)
+        sums = torch.zeros(cpu_kernels.SUMS, dtype=torch.float64, device=state.device)
+        self._kernels.launch("normal_equations", blocks, {
+            "points": level.points, "live": level.live, "state": state, "partial": partial, "n": n, "width": width,
+            "height": height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "gate": level.gate,
+            "balance": balance, "sigma_floor": config.sigma_floor, "sigma_slope": config.sigma_slope,
+        })  # fmt: skip
+        self._kernels.launch("advance", 1, {
+            "partial": partial, "sums": sums, "state": state, "blocks": blocks, "moves": int(moves),
+            "finest": int(finest),
+        })  # fmt: skip
+        return sums
+
+    def _each(self, count: int, kernel: str, given: dict[str, object]) -> None:
+        """A thread for each of so many."""
+        if count:
+            self._kernels.launch(kernel, -(-count // THREADS), given)
+
+
+def _levels(
+    images: _Images, frame: Frame, rendering: Rendering, weight: Plane, config: AlignmentConfig
+) -> tuple[list[_Level], Tensor]:
+    """As `alignment._levels`."""
+    intensity, depth, composited, solid = images.rendered(rendering, config.min_alpha)
+    weights, (live, live_depth) = weight.contiguous(), images.live(frame)
+    camera, levels, solid_points = frame.camera, list[_Level](), depth.new_empty(cpu_kernels.POINT, 0)
+    for number, passes in enumerate(passes_of_levels(config, camera)):
+        if number:
+            intensity, weights, live = (images.halved("intensity", image) for image in (intensity, weights, live))
+            depth, live_depth = images.halved("depth", depth), images.halved("depth", live_depth)
+            if not levels:
+                composited, solid = images.halved("intensity", composited), images.halved("depth", solid)
+            camera = camera.scaled(0.5)
+        if passes:
+            sampling = (2, config.stride) if camera.width > cpu.SPARSE else (1, 1)
+            gate = 2 * config.gate if number else config.gate
+            if not levels:
+                solid_points = images.points(composited, solid, weights, camera, *sampling)
+            points = images.points(intensity, depth, weights, camera, *sampling)
+            levels.append(_Level(passes, points, images.sampled(live, live_depth), camera, gate))
+    return levels, solid_points
+
+
+def align(
+    kernels: Kernels, frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, config: AlignmentConfig
+) -> Alignment:
+    """As `alignment.align`, with all images on a GPU; the host waits once, for what was found.
+
+    Args:
+        kernels: Of `alignment_text`, for that GPU.
+        frame: The live frame.
+        rendering: The map seen from `T_map_ref` with the frame's camera.
+        weight: W_tr of Eq. 18 at every rendered pixel.
+        T_map_ref: Pose of the rendered view, and the guess to start from; on the CPU.
+        config: Constants.
+    """
+    images = _Images(kernels)
+    levels, solid_points = _levels(images, frame, rendering, weight, config)
+    finest, start = levels[0], _start(frame.depth.device)
+    state, last = start.clone(), start.new_zeros(cpu_kernels.SUMS)
+    for level in reversed(levels):
+        state[_COLOR_SCALE : _DONE + 1] = start[_COLOR_SCALE : _DONE + 1]
+        for _ in range(level.passes):
+            last = images.passed(level, state, config, balance=config.depth_weight, moves=True, finest=level is finest)
+    at_rest = {"moves": False, "finest": True}
+    color = images.passed(finest, state, config, balance=0.0, **at_rest)
+    both = images.passed(finest, state, config, balance=1.0, **at_rest)
+    on_solid = _Level(0, solid_points, finest.live, finest.camera, finest.gate)
+    solid = images.passed(on_solid, state, config, balance=config.depth_weight, **at_rest)
+    count = (finest.points[cpu_kernels.PZ] != 0).sum().double()[None]
+    told = torch.cat((state, last, color, both, solid, count)).cpu().numpy()
+    state_found, *sums, points = np.split(told, np.cumsum([_STATE, *[cpu_kernels.SUMS] * 4]))
+    return concluded(
+        T_map_ref,
+        state_found[_POSE:_GAIN].reshape(4, 4),
+        int(state_found[_PASSES]),
+        Photometry(*state_found[_GAIN:_DONE].tolist()),
+        points=int(points[0]),
+        last=sums[0],
+        color=sums[1],
+        both=sums[2],
+        solid=sums[3],
+    )
