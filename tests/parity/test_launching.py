@@ -17,9 +17,10 @@ import sys
 from types import SimpleNamespace
 import torch
 from tcgsplat.render import reference
-from tcgsplat.render.cuda import CudaRasterizer
+from tcgsplat.render.cuda import CudaRasterizer, launching
 from test_numba_cpu import draw, images, random_inputs
 
+launching._nvrtc_names = lambda: ["libnvrtc.so"]  # the one of this test, though another may be installed
 torch.cuda.get_device_capability = lambda device: (9, 0)
 torch.cuda.current_stream = lambda device: SimpleNamespace(cuda_stream=7, synchronize=lambda: None)
 inputs = random_inputs(60, 1)
@@ -35,9 +36,11 @@ REFUSE = """
 import torch
 from types import SimpleNamespace
 from tcgsplat.errors import BackendUnavailableError
+from tcgsplat.render.cuda import launching
 from tcgsplat.render.cuda.launching import Compiled, compiled, nvrtc_library
 from tcgsplat.render.cuda.rasterizer import kernel_text
 
+launching._nvrtc_names = lambda: ["libnvrtc.so"]
 torch.cuda.get_device_capability = lambda device: (9, 0)
 torch.cuda.current_stream = lambda device: SimpleNamespace(cuda_stream=7, synchronize=lambda: None)
 try:

@@ -184,9 +184,11 @@ def compiled(nvrtc: ctypes.CDLL, text: str, architecture: str) -> bytes:
             nvrtc.nvrtcGetProgramLogSize(program, ctypes.byref(size))
             log = ctypes.create_string_buffer(size.value)
             nvrtc.nvrtcGetProgramLog(program, log)
+            said = log.value.decode().splitlines()
+            first = next((line for line in said if "error" in line), "it does not say why")
             raise BackendUnavailableError(
-                f"NVRTC does not compile the kernels for {architecture}: {log.value.decode().strip()}; a torch that "
-                "is built for a newer CUDA knows newer GPUs"
+                f"NVRTC does not compile the kernels for {architecture}: {first}; a torch that is built for a newer "
+                "CUDA knows newer GPUs"
             )
         nvrtc.nvrtcGetCUBINSize(program, ctypes.byref(size))
         binary = ctypes.create_string_buffer(size.value)
