@@ -4,7 +4,8 @@
 #   benchmarks/gpu_session.sh pack FOLDER                  where pip works: puts into FOLDER the wheels that it lacks
 #   benchmarks/gpu_session.sh cut SEQUENCE N FOLDER        the first N frames of a TUM sequence, if less is to be carried
 #   benchmarks/gpu_session.sh check FOLDER OUT [CHECK...]  there, in a checkout: installs the wheels, makes the checks,
-#                                                          all or some, and leaves in OUT a log of each, and checks.txt
+#                                                          all or some; leaves in OUT a log of each, and checks.txt,
+#                                                          and all of it in OUT.tar.gz
 #
 # SEQUENCE=FOLDER is a recording for the checks `tum` and `memory`, LIMIT=N its first frames, PATIENCE=S the seconds a
 # check may take. Nothing of the other machine is changed: the wheels go to a folder of their own under /tmp.
@@ -44,14 +45,17 @@ tcgsplat() { python3 -m tcgsplat.cli.main "$@"; }
 sequence() { [[ -d ${SEQUENCE:-} ]] || { echo "no recording: set SEQUENCE to its folder"; return 3; }; }
 
 check_doctor() { nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv; tcgsplat doctor; }
-check_parity() { python3 -m pytest -p no:cacheprovider tests/parity -k cuda; }
+check_parity() { python3 -m pytest -p no:cacheprovider tests/parity -k "cuda and not emulated"; }
+check_memcheck() { compute-sanitizer --tool memcheck python3 -m pytest -p no:cacheprovider tests/parity/test_cuda.py -k "cuda and not emulated"; }
 check_tests() { python3 -m pytest -p no:cacheprovider tests/unit tests/regression -n 8; }
 check_twice() {
     for name in one other; do tcgsplat demo --backend cuda --frames 120 --out "$WORK/$name" || return; done
     cmp "$WORK/one/run/map.ply" "$WORK/other/run/map.ply"
 }
 check_bench() { tcgsplat bench gpu --out "$OUT/bench"; }
-check_iterations() { tcgsplat bench gpu --frames 0 --out "$OUT/iterations"; }
+check_iterations() { tcgsplat bench gpu --frames 0 --no-bare --out "$OUT/iterations"; }
+check_beside() { tcgsplat bench gpu --frames 0 --out "$OUT/beside"; }  # gsplat, which compiles for minutes at first
+check_sync() { python3 benchmarks/gpu_waits.py; }
 check_demo() { tcgsplat demo --backend cuda --out "$WORK/demo" && cp "$WORK"/demo/run/{summary,report}.json "$OUT"; }
 check_demo_cpu() { tcgsplat demo --backend numba --out "$WORK/demo-cpu"; }
 check_gsplat() {  # compiled before the tests, each of which has only so much time
@@ -79,7 +83,7 @@ check() {
     mkdir -p "$OUT" && OUT=$(cd "$OUT" && pwd) && installed "$folder" || return
     export OUT WORK PYTHONPATH
     export -f tcgsplat sequence
-    for name in "${@:-doctor parity iterations demo demo_cpu twice tum memory gsplat}"; do
+    for name in "${@:-doctor parity memcheck sync iterations demo demo_cpu twice tum memory gsplat beside}"; do
         for name in $name; do
             export -f "check_$name" || return
             SECONDS=0
@@ -89,11 +93,12 @@ check() {
             tail -n 5 "$OUT/$name.log"
         done
     done
+    tar -czf "$OUT.tar.gz" -C "$OUT" .
 }
 
 case ${1:-} in
     pack) pack "${2:?a folder for the wheels}" ;;
     cut) cut "$(realpath "${2:?a sequence}")" "${3:?how many frames}" "$(realpath -m "${4:?a folder}")" ;;
     check) check "${2:?the folder with the wheels}" "${3:?a folder for what comes out}" "${@:4}" ;;
-    *) sed -n '2,12s/^# \?//p' "$0"; exit 2 ;;
+    *) sed -n '2,13s/^# \?//p' "$0"; exit 2 ;;
 esac

@@ -3,6 +3,7 @@
 import ctypes
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -129,6 +130,41 @@ def test_many_splats_over_one_tile_take_several_batches(place: str, folder: Path
     for name in INPUTS:
         a, b = leaves[name].grad.cpu().double(), expected[name].grad
         assert (a - b).norm() < 1e-4 * b.norm(), name
+
+
+def test_counting_and_listing_may_round_differently(folder: Path):
+    """What was counted and is not listed is nowhere; what is listed beyond the count is left out."""
+    if COMPILER is None:
+        pytest.skip("no C++ compiler to emulate with")
+    text = exact_text(4)
+    for wrong in ("count += 2 * reaches(record, x, y)", "count += reaches(record, x, y) && (x + y) % 2"):
+        assert "count += reaches(record, x, y)" in text
+        changed = EmulatedKernels(text.replace("count += reaches(record, x, y)", wrong), folder)
+        leaves = leaves_of(random_inputs(150, 0), torch.device("cpu"))
+        drawn = images(draw(CudaRasterizer(torch.device("cpu"), {4: changed}), leaves))
+        drawn.sum().backward()
+        if "2 *" in wrong:
+            assert torch.equal(drawn, images(draw(opened("emulated", folder, exact=True), leaves)))
+        assert all(torch.isfinite(leaf.grad).all() for leaf in leaves.values())
+
+
+def test_nobody_waits_for_a_gradient_that_is_not_asked_for(place: str, folder: Path):
+    rasterizer = opened(place, folder)
+    leaves = leaves_of(random_inputs(30, 0), rasterizer.device)
+    drawn = images(draw(rasterizer, {**leaves, "T_cam_map": leaves["T_cam_map"].detach()}))
+    assert drawn.grad_fn is not None
+    (bridge,) = {node for node in nodes_of(drawn.grad_fn) if type(node).__name__ == "_DrawBackward"}
+    given: list[Any] = []
+    bridge.register_hook(lambda inputs, _outputs: given.extend(inputs))
+    drawn.sum().backward()
+    assert [value is None for value in given] == [*[False] * 5, True]
+
+
+def nodes_of(node: Any) -> Iterator[Any]:
+    yield node
+    for following, _ in node.next_functions:
+        if following is not None:
+            yield from nodes_of(following)
 
 
 def test_nothing_to_draw(place: str, folder: Path):

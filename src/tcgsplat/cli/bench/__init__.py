@@ -119,6 +119,8 @@ class Gpu:
     """Rasterizers to time, the first of them end to end too; if left out, cuda and, where it is installed, gsplat."""
     sizes: tuple[str, ...] = ("640x480x150000", "640x480x600000", "1200x680x150000", "1200x680x600000")
     """Of the random scenes: width, height, Gaussians; none to leave them out."""
+    bare: bool = True
+    """Beside them gsplat alone, if it is installed; it compiles when it is first used, some minutes."""
     repeats: int = 10
     """Timed runs of each contender on each scene."""
     steps: int = 60

@@ -123,7 +123,7 @@ def command(args: Gpu, flags: Mapping[str, str]) -> int:
     rasterizers, left_out = opened(args.backends)
     bare = None
     try:
-        bare = rasterization()
+        bare = rasterization() if args.bare else None
     except BackendUnavailableError as error:
         left_out = {**left_out, BARE: str(error)}
     out = args.out or Path("runs") / "bench-gpu"

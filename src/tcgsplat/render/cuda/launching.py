@@ -9,6 +9,7 @@ import hashlib
 import os
 import re
 import sys
+import threading
 from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
@@ -65,6 +66,8 @@ class Signatures:
         self._bodies = dict(re.findall(r"struct (\w+) \{(.*?)\n\};", code, re.DOTALL))
         self.arguments = dict(re.findall(r"KERNEL\((\w+), (\w+)\) \{", code))
         """From kernel to the name of its struct."""
+        for struct in self.arguments.values():
+            self._structure(struct)  # made now, by one thread: another one's would be another class
 
     def filled(self, kernel: str, values: Mapping[str, Any]) -> ctypes.Structure:
         """The struct of a kernel, with these values; tensors must live until it has run.
@@ -119,13 +122,16 @@ class Compiled:
         """
         self._signatures, self._device = Signatures(text), device
         major, minor = torch.cuda.get_device_capability(device)
-        binary = _compiled(text, f"sm_{major}{minor}")
+        architecture = f"sm_{major}{minor}"
+        binary = _compiled(text, architecture)
         torch.cuda.current_stream(device).synchronize()  # from here on there is a context
         self._driver = _library("the CUDA driver", _driver_names())
         self._context, self._module = ctypes.c_void_p(), ctypes.c_void_p()
         self._call("cuDevicePrimaryCtxRetain", ctypes.byref(self._context), ctypes.c_int(device.index or 0))
         self._call("cuCtxSetCurrent", self._context)
-        self._call("cuModuleLoadData", ctypes.byref(self._module), binary)
+        if self._driver.cuModuleLoadData(ctypes.byref(self._module), binary):  # what was kept may be damaged
+            binary = _compiled(text, architecture, again=True)
+            self._call("cuModuleLoadData", ctypes.byref(self._module), binary)
         self._functions: dict[str, ctypes.c_void_p] = {}
         for name in self._signatures.arguments:
             function = ctypes.c_void_p()
@@ -133,7 +139,15 @@ class Compiled:
             self._functions[name] = function
 
     def launch(self, name: str, blocks: int, arguments: Mapping[str, Any]) -> None:
-        """See `Kernels`; on the current stream, without waiting."""
+        """See `Kernels`; on the current stream, without waiting.
+
+        Raises:
+            TypeError: for arguments that are not the declared ones, or not on this GPU.
+            BackendUnavailableError: if the driver refuses.
+        """
+        elsewhere = [key for key, value in arguments.items() if getattr(value, "device", self._device) != self._device]
+        if elsewhere:
+            raise TypeError(f"{name}: {elsewhere} must be on {self._device}")
         filled = self._signatures.filled(name, arguments)
         pointers = (ctypes.c_void_p * 1)(ctypes.addressof(filled))
         stream = ctypes.c_void_p(torch.cuda.current_stream(self._device).cuda_stream)
@@ -149,24 +163,28 @@ class Compiled:
             raise BackendUnavailableError(f"the CUDA driver refuses {function}: {said}; `tcgsplat doctor` tells more")
 
 
-def _compiled(text: str, architecture: str) -> bytes:
-    """The kernels as machine code, from the cache if they are there."""
+def _compiled(text: str, architecture: str, *, again: bool = False) -> bytes:
+    """The kernels as machine code, from the cache if they are there; or compiled again, and kept in their place."""
     nvrtc = nvrtc_library()
     version = (ctypes.c_int(), ctypes.c_int())
     nvrtc.nvrtcVersion(*map(ctypes.byref, version))
-    key = f"{version[0].value}.{version[1].value} {architecture} {text}"
+    key = f"{version[0].value}.{version[1].value} {_options(architecture)} {text}"
     kept = _cache_folder() / f"kernels-{hashlib.sha256(key.encode()).hexdigest()[:16]}.cubin"
-    if kept.is_file():
+    if kept.is_file() and not again:
         return kept.read_bytes()
     binary = compiled(nvrtc, text, architecture)
     try:
         kept.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = kept.with_suffix(f".{os.getpid()}")
+        unfinished = kept.with_suffix(f".{os.getpid()}.{threading.get_ident()}")
         unfinished.write_bytes(binary)
         unfinished.replace(kept)
     except OSError:  # then it is compiled again the next time
         pass
     return binary
+
+
+def _options(architecture: str) -> list[str]:
+    return [f"--gpu-architecture={architecture}", "--use_fast_math", "--std=c++17"]
 
 
 def compiled(nvrtc: ctypes.CDLL, text: str, architecture: str) -> bytes:
@@ -175,7 +193,7 @@ def compiled(nvrtc: ctypes.CDLL, text: str, architecture: str) -> bytes:
     Raises:
         BackendUnavailableError: with what NVRTC says, if it refuses.
     """
-    options = [f"--gpu-architecture={architecture}", "--use_fast_math", "--std=c++17"]
+    options = _options(architecture)
     program, size = ctypes.c_void_p(), ctypes.c_size_t()
     nvrtc.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"tcgsplat.cu", 0, None, None)
     array = (ctypes.c_char_p * len(options))(*[option.encode() for option in options])
@@ -218,7 +236,7 @@ def _nvrtc_names() -> list[str]:
     of_torch = sorted(
         (str(path) for path in found if "alt" not in path.name), key=lambda name: f".so.{major}" not in name
     )
-    return [*of_torch, "libnvrtc.so", "/usr/local/cuda/lib64/libnvrtc.so"]
+    return [*of_torch, f"libnvrtc.so.{major}", "libnvrtc.so", "/usr/local/cuda/lib64/libnvrtc.so"]
 
 
 def _driver_names() -> list[str]:

@@ -191,14 +191,15 @@ struct List {
     const long long* ends;      // [n] sums of their counts, each one's own included
     int* tiles;                 // [pairs] in the order of depth
     int* owners;                // [pairs] the Gaussian of each
-    int n, tiles_x;
+    int n, tiles_x, nowhere;    // the last is behind all tiles
 };
 
 KERNEL(list, List) {
     const int slot = blockIdx.x * THREADS + threadIdx.x;
     if (slot >= a.n) return;
     long long at = slot ? a.ends[slot - 1] : 0;
-    if (at == a.ends[slot]) return;
+    const long long end = a.ends[slot];
+    if (at == end) return;
     const int owner = (int)a.order[slot];
     const int* rectangle = a.rectangles + 4 * owner;
     float record[6];
@@ -206,10 +207,12 @@ KERNEL(list, List) {
     for (int k = 0; k < 6; k++) record[k] = a.records[RECORD * owner + k];
     for (int y = rectangle[1]; y <= rectangle[3]; y++)
         for (int x = rectangle[0]; x <= rectangle[2]; x++)
-            if (reaches(record, x, y)) {
+            if (at < end && reaches(record, x, y)) {
                 a.tiles[at] = y * a.tiles_x + x;
                 a.owners[at++] = owner;
             }
+    // Nothing is left if the two kernels round alike, which no compiler promises.
+    for (; at < end; at++) a.tiles[at] = a.nowhere, a.owners[at] = owner;
 }
 
 struct ProjectBackward {

@@ -37,7 +37,7 @@ def _sums(features: int) -> int:
 
 
 class CudaRasterizer:
-    """CUDA kernels; float32; any number of feature channels in one pass."""
+    """CUDA kernels; float32; up to 22 feature channels, as many as a block's shared memory holds, in one pass."""
 
     name = "cuda"
 
@@ -101,7 +101,7 @@ def _listed(kernels: Kernels, seen: dict[str, Tensor], tiles_x: int, tiles: int)
     if total:
         kernels.launch("list", _blocks(n), {
             "records": seen["records"], "rectangles": seen["rectangles"], "order": order, "ends": ends, "tiles": tile,
-            "owners": owners, "n": n, "tiles_x": tiles_x,
+            "owners": owners, "n": n, "tiles_x": tiles_x, "nowhere": tiles,
         })  # fmt: skip
     if tiles <= torch.iinfo(torch.int16).max:  # sixteen bits are sorted in half the passes
         tile = tile.to(torch.int16)
@@ -165,5 +165,6 @@ class _Draw(torch.autograd.Function):
         if n:
             given = projected | {"sums": sums, "features": c}
             kernels.launch("project_backward", _blocks(n), given | grads | {"d_pose": d_pose})
-        d_T_cam_map = d_pose.sum(dim=0, dtype=torch.float64).view(4, 4).to(ctx.pose_like)
-        return None, None, *grads.values(), d_T_cam_map
+        if not ctx.needs_input_grad[-1]:  # else a pose on the CPU would be waited for
+            return None, None, *grads.values(), None
+        return None, None, *grads.values(), d_pose.sum(dim=0, dtype=torch.float64).view(4, 4).to(ctx.pose_like)
