@@ -162,7 +162,9 @@ KERNEL(project, Project) {
     const float half_u = sqrtf(fmaxf(k, 0.0f) * bu), half_v = sqrtf(fmaxf(k, 0.0f) * bv);
     const float x0 = fmaxf(ceilf(u - half_u), 0.0f), x1 = fminf(floorf(u + half_u), camera.width - 1.0f);
     const float y0 = fmaxf(ceilf(v - half_v), 0.0f), y1 = fminf(floorf(v + half_v), camera.height - 1.0f);
-    const bool visible = k >= 0.0f && x0 <= x1 && y0 <= y1 && g.depth > NEAR_PLANE;
+    // Of needles thousands of pixels long rounding leaves no determinant, which is never below BLUR^2.
+    const bool sound = g.inverse > 0.0f && g.inverse <= 1.001f / (BLUR * BLUR);
+    const bool visible = k >= 0.0f && x0 <= x1 && y0 <= y1 && g.depth > NEAR_PLANE && sound;
     a.visible[i] = visible;
     a.depths[i] = visible ? g.depth : 3.4e38f;
     if (!visible) {

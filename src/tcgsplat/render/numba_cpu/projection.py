@@ -57,6 +57,7 @@ from tcgsplat.render.numba_cpu.simd import (
 from tcgsplat.render.protocol import BLUR, MIN_ALPHA, NEAR_PLANE, PLANE_SOFTENING
 
 _BLUR, _SOFT, _NEAR = np.float32(BLUR), np.float32(PLANE_SOFTENING), np.float32(NEAR_PLANE)
+_MOST_INVERSE = np.float32(1.001 / BLUR**2)
 _LOG2_MIN_ALPHA = np.float32(math.log2(MIN_ALPHA))
 _TWO_LN2 = np.float32(2 * math.log(2))
 _HALF_LOG2E = np.float32(-0.5 / math.log(2))
@@ -129,6 +130,8 @@ def forward(P, start, stop, cam, tiles_x, records, depths, rectangles):
         x0, y0 = maximum(zero - floor(half_u - u), zero), maximum(zero - floor(half_v - v), zero)
         x1, y1 = minimum(floor(u + half_u), last_x), minimum(floor(v + half_v), last_y)
         seen = minimum(minimum(x1 - x0, y1 - y0), minimum(k, where_ge(spread(_NEAR), z_true, zero - one, zero)))
+        # Of needles thousands of pixels long rounding leaves no determinant, which is never below BLUR^2.
+        seen = minimum(seen, minimum(inverse, _MOST_INVERSE - inverse))
         left, top = floor(minimum(x0, last_x) * _PER_TILE), floor(minimum(y0, last_y) * _PER_TILE)
         columns, rows = floor(maximum(x1, zero) * _PER_TILE) - left, floor(maximum(y1, zero) * _PER_TILE) - top
         first, span = top * np.float32(tiles_x) + left, rows * _SPAN_UNIT + columns
