@@ -367,7 +367,7 @@ def test_a_killed_run_is_resumed_as_if_nothing_had_happened(
 ):
     assert resumed(room_folder, cut_off(run).path) == 0
     said = capsys.readouterr()
-    assert said.err == "" and said.out.startswith(f"{FRAMES} frames in ")
+    assert said.err == "" and said.out.startswith(f"{FRAMES} frames, ") and " of them now, in " in said.out
     assert_same_run(run.path, Path(finished.args[-1]))
     summary = run.summary()
     assert (summary["resumed_at"], summary["frames"], summary["submaps"]) == (16, FRAMES, 3)
@@ -478,7 +478,9 @@ def test_ctrl_c_and_on_again(
     assert main(["eval", str(out)]) == 0
     capsys.readouterr()
     assert resumed(room_folder, out) == 0
-    assert capsys.readouterr().out.startswith(f"{FRAMES} frames in ")
+    assert capsys.readouterr().out.startswith(
+        f"{FRAMES} frames, {FRAMES - 8 * sealed} of them now, " if sealed else "24 "
+    )
     assert_same_run(out, Path(finished.args[-1]))
     assert (run.summary()["interrupted"], run.summary()["resumed_at"]) == (False, 8 * sealed or None)
 

@@ -92,10 +92,12 @@ def test_threads_are_told_to_sleep_before_anything_is_imported(given: dict[str, 
         (["run", "nowhere"], 1, "tcgsplat: no folder nowhere; check the path\n"),
         (["run", "nowhere", "--config", "no.toml"], 1, "tcgsplat: cannot take settings from no.toml: "),
         (["eval"], 2, "tcgsplat: give a run directory, or --trajectory and --sequence\n"),
-        (["eval", "nowhere"], 1, "tcgsplat: nowhere is not a run; give the folder that `tcgsplat run` wrote"),
+        (["eval", "nowhere"], 1, "tcgsplat: there is no folder nowhere; give the one that `tcgsplat run` wrote"),
         (["eval", "--trajectory", "t.txt"], 2, "tcgsplat: --trajectory needs something to compare with; "),
         (["eval", "nowhere", "--withheld-every", "0"], 2, "tcgsplat: --stride and --withheld-every count from 1\n"),
-        (["export", "nowhere"], 1, "tcgsplat: nowhere is not a run; "),
+        (["export", "nowhere"], 1, "tcgsplat: there is no folder nowhere; "),
+        (["bench", "confidence"], 2, "tcgsplat: give the folders of the sequences, such as"),
+        (["bench", "ablation"], 2, "tcgsplat: give the folders of the sequences, such as"),
         (["bench", "nothing"], 2, "render, track"),
         (["bench", "track"], 2, "FOLDER"),
         (["bench", "track", "nowhere"], 1, "tcgsplat: no folder nowhere; check the path\n"),
@@ -120,10 +122,10 @@ def test_what_is_wrong_is_said_on_standard_error(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_debug_shows_where_it_went_wrong(capsys: pytest.CaptureFixture[str]):
-    assert main(["export", "nowhere", "--debug"]) == 1
+def test_debug_shows_where_it_went_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["export", str(tmp_path), "--debug"]) == 1
     said = capsys.readouterr().err
-    assert "Traceback" in said and said.endswith("json')\n") and "tcgsplat: nowhere is not a run" in said
+    assert "Traceback" in said and said.endswith("json')\n") and f"tcgsplat: {tmp_path} is not a run" in said
 
 
 # Settings.
@@ -227,7 +229,9 @@ def test_the_first_frame_does_not_count_in_times():
     assert result.ms_per_frame == pytest.approx(70.0)
     assert result.ms_per_frame_median == pytest.approx(40.0)
     assert result.stage_ms == pytest.approx({"track": 20.0, "map": 40.0})
-    assert str(result) == "4 frames in 21.0 s (70 ms a frame), 1 lost, 2 submaps, 2 loops closed, 30 Gaussians"
+    assert str(result) == (
+        "4 frames in 21.0 s (70 ms a frame, beginning and end aside), 1 lost, 2 submaps, 2 loops closed, 30 Gaussians"
+    )
     versions = json.loads(json.dumps(result.to_dict()))["versions"]
     assert versions["torch"] == torch.__version__
     assert versions["source"] == subprocess.run(
@@ -293,7 +297,11 @@ def test_only_a_run_is_ever_overwritten(tmp_path: Path):
     config, data = SlamConfig(), tmp_path / "data"
     run = begin(tmp_path / "run", config, data, Part(), overwrite=False)
     (run.path / "submaps" / "0000.npz").write_bytes(b"old")
-    with pytest.raises(ArchiveError, match="exists; choose another folder by --out, or replace the run by --overwrite"):
+    choose = "choose another folder by --out, or replace the run by --overwrite"
+    with pytest.raises(ArchiveError, match=f"exists; go on with the unfinished run in it by --resume, {choose}"):
+        begin(run.path, config, data, Part(), overwrite=False)
+    run.write_summary({"interrupted": False})
+    with pytest.raises(ArchiveError, match=f"exists; {choose}"):
         begin(run.path, config, data, Part(), overwrite=False)
     assert (run.path / "submaps" / "0000.npz").exists()
     assert begin(run.path, config, data, Part(), overwrite=True).submap_count == 0

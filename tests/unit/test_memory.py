@@ -244,4 +244,4 @@ def test_a_run_that_ran_out_says_what_is_kept_and_goes_on_from_there(
 
 def test_no_run_has_less_than_no_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["run", str(tmp_path), "--max-gpu-memory", "-2"]) == 2
-    assert capsys.readouterr().err == "tcgsplat: --mapper.max_gpu_memory is -2.0; it must be at least 0\n"
+    assert capsys.readouterr().err == "tcgsplat: --max-gpu-memory is -2; give the GB that may be taken, above 0\n"

@@ -298,8 +298,10 @@ def test_create_refuses_what_is_there_and_open_refuses_what_is_not(tmp_path: Pat
         RunDirectory.create(tmp_path / "file", config_toml="", sequence="")
     with pytest.raises(ArchiveError, match="cannot make the folder"):
         RunDirectory.create(tmp_path / "file" / "below", config_toml="", sequence="")
-    with pytest.raises(ArchiveError, match="is not a run; give the folder"):
+    with pytest.raises(ArchiveError, match=r"there is no folder .*nowhere; give the one"):
         RunDirectory.open(tmp_path / "nowhere")
+    with pytest.raises(ArchiveError, match="is not a run; give the folder"):
+        RunDirectory.open(tmp_path)
     about = json.loads((tmp_path / "empty" / "run.json").read_text())
     (tmp_path / "empty" / "run.json").write_text(json.dumps(about | {"version": 99}))
     with pytest.raises(ArchiveError, match="layout version 99"):

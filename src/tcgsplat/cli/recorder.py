@@ -116,7 +116,11 @@ def begin(
     """
     if not is_free(path):
         if not overwrite:
-            raise ArchiveError(f"{path} exists; choose another folder by --out, or replace the run by --overwrite")
+            unfinished = (path / "run.json").exists() and not (path / "summary.json").exists()
+            goes_on = "go on with the unfinished run in it by --resume, " if unfinished else ""
+            raise ArchiveError(
+                f"{path} exists; {goes_on}choose another folder by --out, or replace the run by --overwrite"
+            )
         shutil.rmtree(RunDirectory.open(path).path)  # `open` refuses a folder that holds no run
     data, command = str(folder.expanduser().resolve()), shlex.join(["tcgsplat", *sys.argv[1:]])
     request = json.dumps({"command": command, "backend": backend, **asdict(part)}, indent=2) + "\n"

@@ -13,9 +13,10 @@ class Args:
     """Merge a run's submaps into one map, and optimise it over the keyframes of all of them.
 
     The keyframes hold their pictures: the recording is not needed. Poses and confidence stay; the map gets sharper. It
-    is written to map.npz in the run directory, which `eval` scores and `export` writes; the submaps stay as they are.
-    How far --seconds gets depends on the machine; --steps gives the same bits every time. Ctrl-C ends it early and
-    keeps what is refined so far; a second one leaves the run as it was.
+    is written to map.npz in the run directory, which `eval` scores and `export` writes; the submaps stay as they are,
+    and another `refine` begins with them again and replaces it. How far --seconds gets depends on the machine; --steps
+    gives the same bits every time. Ctrl-C ends it early and keeps what is refined so far; a second one leaves the run
+    as it was.
     """
 
     run: tyro.conf.Positional[Path]

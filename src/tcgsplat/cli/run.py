@@ -64,6 +64,8 @@ def command(args: Args) -> int:
 
     if args.resume and (args.overwrite or args.realtime):
         raise UsageError("--resume goes with neither --overwrite nor --realtime, which repeats nothing; leave one out")
+    if args.max_gpu_memory is not None and not args.max_gpu_memory > 0:
+        raise UsageError(f"--max-gpu-memory is {args.max_gpu_memory:g}; give the GB that may be taken, above 0")
     limit = {} if args.max_gpu_memory is None else {"mapper.max_gpu_memory": repr(args.max_gpu_memory)}
     config = resolved(args.preset, args.config, {**args.settings, **limit}, args.seed)
     part = Part(args.start, args.stride, args.limit)

@@ -83,8 +83,10 @@ class Summary:
 
     def __str__(self) -> str:
         """One line for a person."""
+        now = "" if self.resumed_at is None else f", {self.frames - self.resumed_at} of them now,"
         return (
-            f"{self.frames} frames in {self.seconds:.1f} s ({self.ms_per_frame:.0f} ms a frame), "
+            f"{self.frames} frames{now} in {self.seconds:.1f} s ({self.ms_per_frame:.0f} ms a frame, beginning and end "
+            f"aside), "
             f"{self.frames_lost} lost, {self.submaps} submap{'s' * (self.submaps != 1)}, "
             f"{self.loops} loop{'s' * (self.loops != 1)} closed, {self.gaussians} Gaussians"
             f"{self._behind() if self.realtime else ''}"

@@ -74,6 +74,8 @@ class RunDirectory:
         Raises:
             ArchiveError: if the folder holds no run, or one of another version.
         """
+        if not path.exists():
+            raise ArchiveError(f"there is no folder {path}; give the one that `tcgsplat run` wrote")
         about = _read_json(path / "run.json", f"{path} is not a run; give the folder that `tcgsplat run` wrote")
         if about.get("kind") != "run" or about.get("version") != archive.VERSION:
             raise ArchiveError(

@@ -242,8 +242,8 @@ class Scannet(Recorded):
 @dataclass(frozen=True)
 class Args:
     """Time the mapping's kernels on random scenes, the whole system on a recorded sequence, loop closure, or a GPU; see
-    what it is worth on a sequence that confidence guides the system; or run a suite of sequences, and write the paper's
-    tables of it: synthetic, tum, replica or scannet.
+    whether it helps that confidence guides the system, and whether it is true; or run a suite of sequences, and write
+    the paper's tables of it: synthetic, tum, replica or scannet.
     """
 
     what: tyro.conf.OmitSubcommandPrefixes[

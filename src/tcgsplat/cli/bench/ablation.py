@@ -116,6 +116,8 @@ def command(args: Ablation, flags: Mapping[str, str]) -> int:
     """Do the runs that are missing, print the tables, and write them down."""
     config, arms = _config(args, flags), _arms(args)
     part = Part(args.start, args.stride, args.limit)
+    if not args.folders:
+        raise UsageError("give the folders of the sequences, such as `tcgsplat synth FOLDER` makes")
     materials = [_opened(folder, part) for folder in args.folders]
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     out = args.out or Path("runs") / f"ablation-{'-'.join(one.sequence.name for one in materials)}"

@@ -19,6 +19,7 @@ from tcgsplat.cli.progress import RunProgress, say
 from tcgsplat.cli.recorder import Part
 from tcgsplat.cli.settings import resolved
 from tcgsplat.cli.summary import machine, versions
+from tcgsplat.cli.usage import UsageError
 from tcgsplat.config import SlamConfig, to_toml, with_settings
 from tcgsplat.datasets.truth import Event, Truth
 from tcgsplat.errors import EvaluationError
@@ -48,6 +49,9 @@ class Arm:
     model: str
     seed: int
     ate_rmse_cm: float | None
+    frames_lost: int
+    pictures: int
+    """That were predicted."""
     depth: Mapping[str, Mapping[str, float | None]]
     """By measure: `ause` (0 oracle, 1 random), `spearman` (median of the frames), `spearman_p10`, `partial_spearman`,
     `auroc` of bad pixels."""
@@ -68,6 +72,8 @@ class Arm:
 def command(args: Confidence, settings: Mapping[str, str]) -> int:
     """Predict, judge, and write the page."""
     config = resolved(args.preset, args.config, settings, args.seed)
+    if not args.folders:
+        raise UsageError("give the folders of the sequences, such as `tcgsplat synth FOLDER` makes")
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     out = args.out or Path("runs") / "confidence"
     out.mkdir(parents=True, exist_ok=True)
@@ -81,7 +87,9 @@ def command(args: Confidence, settings: Mapping[str, str]) -> int:
             judged[model][arm.sequence] = found.depth
     reliabilities = leave_one_out({name: pairs_of(frames) for name, frames in judged[MODELS[0]].items()})
     calibration = {name: one.normalised_ece for name, one in reliabilities.items()}
-    about = f"{rasterizer.name}, preset {args.preset}, seed {config.seed}; {machine()}"
+    about = (
+        f"{rasterizer.name}, preset {args.preset}, seed {config.seed}; {machine()}. One frame in {args.every} is drawn"
+    )
     _draw(out, judged, reliabilities)
     page = written(arms, calibration, about)
     atomic.write_text(out / "README.md", page)
@@ -132,6 +140,8 @@ def performed(folder: Path, config: SlamConfig, rasterizer: Rasterizer, every: i
         config.confidence.model,
         config.seed,
         None if error is None else 100.0 * error,
+        sum(row.lost for row in slam.trajectory.rows),
+        len(found.depth),
         summary(found.depth),
         summary(found.color),
         summary(kept_back),
@@ -204,23 +214,29 @@ def written(arms: Sequence[Arm], calibration: Mapping[str, float], about: str) -
     """The page."""
     first = [arm for arm in arms if arm.model == MODELS[0]]
     parts = [
-        f"# Is its confidence true?\n\n{about}. Every so many-th frame is drawn from the map as it was before it "
+        f"# Is its confidence true?\n\n{about} from the map as it was before it "
         "came, at the pose that tracking found, and held against the true depth. AUSE is over that of random: 0 is an "
         "oracle, 1 knows nothing. Means over frames; of Spearman's correlation the median and the tenth percentile.",
         "## The two models, depth, predicted before seen\n",
         markdown(
-            ("sequence", "model", "AUSE", "Spearman", "p10", "partial", "AUROC bad", "AUROC fault", "in map", "ATE cm"),
+            (
+                *("sequence", "model", "AUSE", "Spearman", "p10", "partial", "AUROC bad", "AUROC fault", "in map"),
+                *("ATE cm", "frames lost", "pictures"),
+            ),
             [
                 (
                     *(arm.sequence, arm.model, *_cells(arm.depth.get(OURS, {}))),
                     *(_n(arm.fault_auroc, 2), _n(arm.fault_auroc_in_map, 2), _n(arm.ate_rmse_cm)),
+                    *(str(arm.frames_lost), str(arm.pictures)),
                 )
                 for arm in arms
             ],
             left=2,
         ),
-        "AUROC bad: of pixels off by more than 2 cm and 5 %. AUROC fault: of those where the recording was wrong, once "
-        "the map has used the frame; in map: of those of them where the map is wrong too, from all where it is right.",
+        "p10: a tenth of the pictures have less. Partial: beyond what depth, opacity, observations and image gradient "
+        "tell. AUROC bad: how well doubt tells pixels that are off by more than 2 cm and 5 %; fault: those where the "
+        "recording was wrong, once the map has used it; in map: those that became wrong in the map by that, from all "
+        "where it is right. Of frames that were lost nothing is drawn.",
         "## The same of frames that were never mapped, in the finished map\n",
         markdown(
             ("sequence", "model", "AUSE", "Spearman", "p10", "partial", "AUROC bad"),
