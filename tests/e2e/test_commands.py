@@ -492,7 +492,8 @@ def test_broken_frames_are_skipped_and_told(room_folder: Path, tmp_path: Path, c
     said = capsys.readouterr()
     (warning,) = said.err.splitlines()
     assert warning.startswith("tcgsplat: warning: frame 5 is skipped: ") and "0005.png" in warning
-    assert said.out.startswith("8 frames in ")
+    assert said.out.startswith("8 frames in ") and " Gaussians; 1 more could not be read: " in said.out
+    assert RunDirectory.open(tmp_path / "run").summary()["frames_unreadable"] == 1
 
 
 def test_a_run_goes_to_runs_and_is_not_overwritten_by_accident(

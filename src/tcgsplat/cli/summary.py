@@ -64,6 +64,8 @@ class Summary:
     """Captured while the system was busy, and replaced by newer ones before it was free."""
     frames_total: int = 0
     """Captured until the run ended: used or dropped. Images that cannot be read are not among them."""
+    frames_unreadable: int = 0
+    """Before the last one that was used, skipped because an image could not be read."""
     ms_late_median: float | None = None
     """From a frame's capture to the end of its step, the first one included; None if not in real time."""
     ms_late_p95: float | None = None
@@ -90,6 +92,7 @@ class Summary:
             f"{self.frames_lost} lost, {self.submaps} submap{'s' * (self.submaps != 1)}, "
             f"{self.loops} loop{'s' * (self.loops != 1)} closed, {self.gaussians} Gaussians"
             f"{self._behind() if self.realtime else ''}"
+            f"{f'; {self.frames_unreadable} more could not be read' if self.frames_unreadable else ''}"
         )
 
     def _behind(self) -> str:
@@ -165,6 +168,7 @@ class Tally:
             interrupted=interrupted,
             frames_dropped=self.dropped,
             frames_total=len(rows) + self.dropped,
+            frames_unreadable=rows[-1].frame_index + 1 - len(rows) - self.dropped if rows else 0,
             ms_late_median=statistics.median(self.late) if self.late else None,
             ms_late_p95=float(np.percentile(self.late, 95)) if self.late else None,
             seconds_held=self.held,
