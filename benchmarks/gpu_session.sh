@@ -53,7 +53,7 @@ check_twice() {
     cmp "$WORK/one/run/map.ply" "$WORK/other/run/map.ply"
 }
 check_bench() { tcgsplat bench gpu --out "$OUT/bench"; }
-check_iterations() { tcgsplat bench gpu --frames 0 --no-bare --out "$OUT/iterations"; }
+check_iterations() { tcgsplat bench gpu --frames 0 --backends cuda --no-bare --out "$OUT/iterations"; }
 check_beside() { tcgsplat bench gpu --frames 0 --out "$OUT/beside"; }  # gsplat, which compiles for minutes at first
 check_sync() { python3 benchmarks/gpu_waits.py; }
 check_demo() { tcgsplat demo --backend cuda --out "$WORK/demo" && cp "$WORK"/demo/run/{summary,report}.json "$OUT"; }
