@@ -60,25 +60,11 @@ class Part:
         Raises:
             ArchiveError: if `request.json` is there and makes no sense.
         """
-        request = _request(run)
+        request: dict[str, Any] | None = run.request
         try:
             return Part() if request is None else Part(request["start"], request["stride"], request["limit"])
         except (KeyError, TypeError) as error:
             raise ArchiveError(f"cannot read {run.path / 'request.json'} ({error}); run again") from error
-
-
-def _request(run: RunDirectory) -> dict[str, Any] | None:
-    """What was asked for; None where the run does not say."""
-    path = run.path / "request.json"
-    if not path.exists():
-        return None
-    try:
-        request = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ArchiveError(f"cannot read {path} ({error}); run again") from error
-    if not isinstance(request, dict):
-        raise ArchiveError(f"cannot read {path} (it is no object); run again")
-    return request
 
 
 def resume(path: Path, config: SlamConfig, folder: Path, part: Part, *, backend: str = "") -> RunDirectory:
@@ -96,7 +82,7 @@ def resume(path: Path, config: SlamConfig, folder: Path, part: Part, *, backend:
     other = [f"{name} was {then[name]} and is {now[name]}" for name in now if now[name] != then[name]]
     if other:
         raise ArchiveError(f"the run in {path} has other settings: {'; '.join(other)}; resume it with the same ones")
-    if backend != (drawn := (_request(run) or {}).get("backend") or backend):
+    if backend != (drawn := (run.request or {}).get("backend") or backend):
         raise ArchiveError(
             f"the run in {path} was drawn by {drawn}, and {backend} has other bits; add --backend {drawn}"
         )

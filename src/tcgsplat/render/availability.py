@@ -45,11 +45,20 @@ class Driver:
         return f"CUDA {self.cuda[0]}.{self.cuda[1]}"
 
 
+def driver_library() -> ctypes.CDLL:
+    """Its C interface.
+
+    Raises:
+        OSError: if there is none.
+    """
+    return ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+
+
 def driver() -> Driver | None:
     """The one that is installed, or None."""
     number = ctypes.c_int()
     try:
-        library = ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+        library = driver_library()
         library.cuDriverGetVersion(ctypes.byref(number))
         return Driver((number.value // 1000, number.value % 1000 // 10), library.cuInit(0))
     except (OSError, AttributeError):  # no such file; a file that is something else

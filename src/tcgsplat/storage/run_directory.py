@@ -98,6 +98,16 @@ class RunDirectory:
         return str(_read_json(self.path / "run.json", f"{self.path} is not a run")["sequence"])
 
     @property
+    def request(self) -> dict[str, object] | None:
+        """What `request.json` holds; None where the run does not say what was asked for.
+
+        Raises:
+            ArchiveError: if it is there and makes no sense.
+        """
+        path = self.path / "request.json"
+        return _read_json(path, f"cannot read {path}; run again") if path.exists() else None
+
+    @property
     def submap_count(self) -> int:
         """Sealed submaps on disk, counted from 0 up to the first gap."""
         count = 0

@@ -145,13 +145,14 @@ class Tracker:
 
     def _aligned(self, frame: Frame, rendering: Rendering, guess: Pose) -> Alignment:
         """By the solver where the rendering is, if it is on a GPU, else on the CPU."""
-        if not rendering.alpha.is_cuda:
+        on_gpu = rendering.alpha.is_cuda
+        if not on_gpu:
             frame, rendering = frame.cpu(), rendering.cpu()
         if self._floor is None:
             weight = torch.ones_like(rendering.confidence)
         else:
             weight = eq.tracking_weight(rendering.confidence, floor=self._floor)
-        if not rendering.alpha.is_cuda:
+        if not on_gpu:
             return align(frame, rendering, weight, guess, self._config.alignment)
         from tcgsplat.tracking import cuda_alignment  # noqa: PLC0415  a CPU needs none of it
 

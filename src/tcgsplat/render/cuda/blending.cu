@@ -47,6 +47,13 @@ __device__ inline void load(
     }
 }
 
+// Both ways ask this: what they leave out as too faint is the same.
+__device__ inline float alpha_at(const float* r, float dx, float dy) {
+    return r[5] * exp2f(-((r[2] * dx + r[3] * dy) * dx + r[4] * dy * dy));
+}
+
+__device__ inline float plane_at(const float* r, float dx, float dy) { return r[6] + r[7] * dx + r[8] * dy; }
+
 KERNEL(blend, Blend) {
     __shared__ Shared splats[THREADS];
     const int tile = blockIdx.x, warp = threadIdx.x / 32, lane = threadIdx.x & 31;
@@ -69,13 +76,13 @@ KERNEL(blend, Blend) {
             if (!(splat.warps >> warp & 1)) continue;
             const float* r = splat.record;
             const float dx = x - r[0], dy = y - r[1];
-            const float alpha = r[5] * exp2f(-((r[2] * dx + r[3] * dy) * dx + r[4] * dy * dy));
+            const float alpha = alpha_at(r, dx, dy);
             if (alpha < MIN_ALPHA) continue;
             const float weight = through * alpha;
 #pragma unroll
             for (int f = 0; f < FEATURES; f++) out[f] += weight * splat.features[f];
             out[FEATURES] += weight * r[6];
-            out[FEATURES + 1] += weight * (r[6] + r[7] * dx + r[8] * dy);
+            out[FEATURES + 1] += weight * plane_at(r, dx, dy);
             out[FEATURES + 2] += weight;
             through *= 1.0f - alpha;
             used = (int)(start - first) + k + 1;
@@ -132,7 +139,7 @@ KERNEL(blend_backward, BlendBackward) {
             const Shared& splat = splats[k];
             const float* r = splat.record;
             const float dx = x - r[0], dy = y - r[1];
-            const float alpha = r[5] * exp2f(-((r[2] * dx + r[3] * dy) * dx + r[4] * dy * dy));
+            const float alpha = alpha_at(r, dx, dy);
             const bool seen = start + k < used && alpha >= MIN_ALPHA;
             float* sums = of_warps[warp][k];
             if (!(splat.warps >> warp & 1) || !__any_sync(EVERYONE, seen)) {
@@ -143,7 +150,7 @@ KERNEL(blend_backward, BlendBackward) {
             if (seen) {
                 through /= 1.0f - alpha;
                 const float weight = through * alpha, by_depth = g[FEATURES], by_plane = g[FEATURES + 1];
-                float asked = by_depth * r[6] + by_plane * (r[6] + r[7] * dx + r[8] * dy) + g[FEATURES + 2];
+                float asked = by_depth * r[6] + by_plane * plane_at(r, dx, dy) + g[FEATURES + 2];
 #pragma unroll
                 for (int f = 0; f < FEATURES; f++) {
                     asked += g[f] * splat.features[f];

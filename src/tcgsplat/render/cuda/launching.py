@@ -21,6 +21,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 
 from tcgsplat.errors import BackendUnavailableError
+from tcgsplat.render.availability import driver_library
 
 THREADS = 256
 """Of a block, always."""
@@ -125,7 +126,7 @@ class Compiled:
         architecture = f"sm_{major}{minor}"
         binary = _compiled(text, architecture)
         torch.cuda.current_stream(device).synchronize()  # from here on there is a context
-        self._driver = _library("the CUDA driver", _driver_names())
+        self._driver = driver_library()  # torch has it already
         self._context, self._module = ctypes.c_void_p(), ctypes.c_void_p()
         self._call("cuDevicePrimaryCtxRetain", ctypes.byref(self._context), ctypes.c_int(device.index or 0))
         self._call("cuCtxSetCurrent", self._context)
@@ -222,7 +223,16 @@ def nvrtc_library() -> ctypes.CDLL:
     Raises:
         BackendUnavailableError: if there is none.
     """
-    return _library("NVRTC, CUDA's run-time compiler", _nvrtc_names())
+    names = _nvrtc_names()
+    for name in names:
+        try:
+            return ctypes.CDLL(name)
+        except OSError:
+            continue
+    raise BackendUnavailableError(
+        f"NVRTC, CUDA's run-time compiler, is not to be found as any of {', '.join(names)}; `tcgsplat doctor` tells "
+        "more"
+    )
 
 
 def _nvrtc_names() -> list[str]:
@@ -237,21 +247,6 @@ def _nvrtc_names() -> list[str]:
         (str(path) for path in found if "alt" not in path.name), key=lambda name: f".so.{major}" not in name
     )
     return [*of_torch, f"libnvrtc.so.{major}", "libnvrtc.so", "/usr/local/cuda/lib64/libnvrtc.so"]
-
-
-def _driver_names() -> list[str]:
-    return ["nvcuda.dll"] if sys.platform == "win32" else ["libcuda.so.1", "libcuda.so"]
-
-
-def _library(what: str, names: list[str]) -> ctypes.CDLL:
-    for name in names:
-        try:
-            return ctypes.CDLL(name)
-        except OSError:
-            continue
-    raise BackendUnavailableError(
-        f"{what} is not to be found as any of {', '.join(names)}; `tcgsplat doctor` tells more"
-    )
 
 
 def _cache_folder() -> Path:
