@@ -16,7 +16,9 @@ from beartype import BeartypeConf, beartype
 from jaxtyping import AbstractArray, jaxtyped
 
 SOURCE = Path(__file__).parents[1] / "src"
-IMPORTS_NUMBA = re.compile(r"^(from|import) (numba|llvmlite)", re.MULTILINE)
+IMPORTS_NUMBA = re.compile(
+    r"^(from|import) (numba|llvmlite|tcgsplat\.render\.numba_cpu\.compilation import (inner|kernel)\b)", re.MULTILINE
+)
 LIKE_A_TYPE_CHECKER = BeartypeConf(is_pep484_tower=True)  # an int may stand for a float, as for mypy
 
 

@@ -10,6 +10,8 @@ import torch
 
 from tcgsplat.geometry import se3
 from tcgsplat.tracking import alignment_kernels as kernels
+from tcgsplat.tracking.alignment import normal_equations, reference_points
+from tcgsplat.tracking.pyramids import live_image
 
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
@@ -48,9 +50,9 @@ class Scene:
         return constants
 
     def sums(self) -> Doubles:
-        live = kernels.live_image(self.intensity, self.depth)
+        live = live_image(self.intensity, self.depth)
         live[[0, -1]] = live[:, [0, -1]] = np.nan  # no pass may ask for the border
-        return kernels.normal_equations(self.points, live, self.constants)  # type: ignore[no-any-return]
+        return normal_equations(self.points, live, self.constants)  # type: ignore[no-any-return]
 
 
 def scene(seed: int, count: int = 480) -> Scene:
@@ -293,7 +295,7 @@ def test_reference_points(seed: int, radius: int, stride: int) -> None:
     random = scene(seed)
     weight = np.random.default_rng(seed).random((HEIGHT, WIDTH), np.float32)
     intrinsics = np.array([FX, FY, CX, CY], np.float32)
-    points = kernels.reference_points(random.intensity, random.depth, weight, intrinsics, radius, stride)
+    points = reference_points(random.intensity, random.depth, weight, intrinsics, radius, stride)
     assert points.shape[1] % 16 == 0
     found = points[:, points[kernels.PZ] != 0]
     true = expected_points(random.intensity, random.depth, weight, radius, stride)
@@ -306,36 +308,15 @@ def test_reference_points(seed: int, radius: int, stride: int) -> None:
 @pytest.mark.parametrize("size", [(3, 40), (5, 5), (6, 21), (40, 4)])
 def test_reference_points_of_small_pictures(size: tuple[int, int]) -> None:
     depth = np.full(size, 2.0, np.float32)
-    points = kernels.reference_points(depth, depth, depth, np.array([FX, FY, CX, CY], np.float32), 1, 1)
+    points = reference_points(depth, depth, depth, np.array([FX, FY, CX, CY], np.float32), 1, 1)
     assert np.count_nonzero(points[kernels.PZ]) == max(size[0] - 4, 0) * max(size[1] - 4, 0)
 
 
 def test_what_a_pass_samples() -> None:
     random = scene(3)
-    live = kernels.live_image(random.intensity, random.depth)[1:-1, 1:-1]
+    live = live_image(random.intensity, random.depth)[1:-1, 1:-1]
     image = random.intensity
     np.testing.assert_array_equal(live[..., 0], image[1:-1, 1:-1])
     np.testing.assert_allclose(live[..., 1], (image[1:-1, 2:] - image[1:-1, :-2]) / 2, rtol=1e-6)
     np.testing.assert_allclose(live[..., 2], (image[2:, 1:-1] - image[:-2, 1:-1]) / 2, rtol=1e-6)
     np.testing.assert_array_equal(live[..., 3], random.depth[1:-1, 1:-1])
-
-
-def test_views() -> None:
-    """Intensity, and depth that says -1 where nothing of the world was seen."""
-    rng = np.random.default_rng(0)
-    color = rng.random((6, 8, 3), np.float32)
-    planar = np.ascontiguousarray(color.transpose(2, 0, 1)).transpose(1, 2, 0)  # as the rasterizer gives it
-    alpha, depth = rng.random((6, 8), np.float32), 1 + rng.random((6, 8), np.float32)
-    alpha[0, :2], depth[1, 1] = 0, 0
-    grey = color @ np.array([0.299, 0.587, 0.114], np.float32)
-    np.testing.assert_allclose(kernels.luma(color), grey, rtol=1e-6)
-    np.testing.assert_allclose(kernels.luma(planar), grey, rtol=1e-6)
-
-    intensity, marked = kernels.live_view(color, depth, alpha > 0.5)
-    np.testing.assert_allclose(intensity, grey, rtol=1e-6)
-    np.testing.assert_array_equal(marked, np.where(alpha > 0.5, depth, -1))
-
-    intensity, marked = kernels.rendered_view(planar * alpha[..., None], depth * alpha, alpha, np.float32(0.5))
-    np.testing.assert_allclose(intensity[alpha > 0], grey[alpha > 0], rtol=1e-5)
-    assert not intensity[0, :2].any()
-    np.testing.assert_allclose(marked, np.where(alpha > 0.5, depth, -1), rtol=1e-6)

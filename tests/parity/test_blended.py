@@ -11,8 +11,9 @@ from torch import Tensor
 
 from tcgsplat.confidence.state import ConfidenceConfig, ConfidenceState
 from tcgsplat.geometry import se3
-from tcgsplat.render.numba_cpu import NumbaRasterizer
-from tcgsplat.render.protocol import MAX_OPACITY, MIN_ALPHA, Rasterizer, Splats
+from tcgsplat.render.conventions import MAX_OPACITY, MIN_ALPHA
+from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer
+from tcgsplat.render.protocol import Rasterizer, Splats
 from tcgsplat.render.reference import ReferenceRasterizer, project
 from tcgsplat.render.view import blended, render_view
 from tcgsplat.scene.gaussians import Gaussians

@@ -12,12 +12,12 @@ from test_numba_cpu import CAMERA, INPUTS, away_from_cuts, draw, images, random_
 
 from tcgsplat.errors import BackendUnavailableError
 from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.conventions import MIN_TRANSMITTANCE
 from tcgsplat.render.cuda import CudaRasterizer
 from tcgsplat.render.cuda.launching import Compiled, Signatures, compiled, nvrtc_library
 from tcgsplat.render.cuda.rasterizer import kernel_text
 from tcgsplat.render.cuda.ssim import similarity, ssim_text
 from tcgsplat.render.losses import _SSIM_RADIUS, SSIM_C1, SSIM_C2, ssim_map, ssim_window
-from tcgsplat.render.protocol import MIN_TRANSMITTANCE
 from tcgsplat.render.reference import ReferenceRasterizer
 
 EMULATED = pytest.param(

@@ -13,9 +13,10 @@ from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.availability import extension_obstacles
 from tcgsplat.render.backends import open_rasterizer
+from tcgsplat.render.conventions import MIN_ALPHA, MIN_TRANSMITTANCE
 from tcgsplat.render.gsplat_cuda import TILE, Footprints, GsplatRasterizer, footprints, raster
-from tcgsplat.render.numba_cpu import NumbaRasterizer
-from tcgsplat.render.protocol import MIN_ALPHA, MIN_TRANSMITTANCE, Raster, Splats
+from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer
+from tcgsplat.render.protocol import Raster, Splats
 from tcgsplat.render.reference import ReferenceRasterizer, project
 
 CROWDS = (150, 150, 700)

@@ -16,7 +16,7 @@ from tcgsplat.mapping.optimization import AutogradOptimization, Optimization
 from tcgsplat.mapping.optimizer import PARAMETERS
 from tcgsplat.mapping.seeding import IdSource
 from tcgsplat.mapping.settings import MapperConfig
-from tcgsplat.render.numba_cpu import NumbaRasterizer
+from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer
 from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.submap import Keyframe, Submap
 

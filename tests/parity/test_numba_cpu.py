@@ -11,8 +11,9 @@ import torch
 
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.render.numba_cpu import NumbaRasterizer
-from tcgsplat.render.protocol import MAX_OPACITY, Splats
+from tcgsplat.render.conventions import MAX_OPACITY
+from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer
+from tcgsplat.render.protocol import Splats
 from tcgsplat.render.reference import ReferenceRasterizer, project, visible_footprints
 
 CAMERA = Camera(fx=52.0, fy=54.0, cx=30.1, cy=23.4, width=61, height=45)  # hangs over the edge of the tiles

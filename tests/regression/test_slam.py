@@ -15,7 +15,7 @@ from tcgsplat.loop.settings import LoopConfig
 from tcgsplat.mapping.schedule import ScheduleConfig
 from tcgsplat.mapping.seeding import SeedingConfig
 from tcgsplat.mapping.settings import MapperConfig
-from tcgsplat.render.numba_cpu import NumbaRasterizer
+from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import render_view
 from tcgsplat.scene.frame import Frame

@@ -12,8 +12,10 @@ from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.scene.frame import Frame
 from tcgsplat.tensors import Pose
+from tcgsplat.tracking import alignment
 from tcgsplat.tracking import alignment_kernels as kernels
-from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, _exp, align, correlation, luma
+from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, _exp, align, correlation
+from tcgsplat.tracking.pyramids import halved, halved_depth, live_image, live_view, luma, rendered_view
 
 CONFIG = AlignmentConfig(
     iterations=(8, 5, 5), stride=1, depth_weight=1.0, min_alpha=0.7, gate=0.05, sigma_floor=0.0017, sigma_slope=0.0019
@@ -42,7 +44,7 @@ def normal_equations(
     T = se3.exp(torch.from_numpy(tangent)).numpy()
     intrinsics, settings = (camera.fx, camera.fy, camera.cx, camera.cy), (0.05, depth_weight, 0.0017, 0.0019)
     constants = np.array([*T[:3, :3].flat, *T[:3, 3], *intrinsics, 1.0, 0.0, 0.05, 2.0, *settings], np.float32)
-    sums = kernels.normal_equations(padded, kernels.live_image(intensity, depth), constants)
+    sums = alignment.normal_equations(padded, live_image(intensity, depth), constants)
     H = np.zeros((6, 6))
     H[np.triu_indices(6)] = sums[:21]
     return H + np.triu(H, 1).T, sums[21:27], sums
@@ -52,7 +54,7 @@ def points_of(frame: Frame, stride: int = 1) -> np.ndarray:
     """The points of a frame [n, POINT]."""
     camera, ones = frame.camera, np.ones((CAMERA.height, CAMERA.width), np.float32)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-    points = kernels.reference_points(luma(frame.color), frame.depth.numpy(), ones, intrinsics, 1, stride)
+    points = alignment.reference_points(luma(frame.color), frame.depth.numpy(), ones, intrinsics, 1, stride)
     return points[:, points[kernels.PZ] > 0].T
 
 
@@ -168,9 +170,30 @@ class TestKernels:
         assert beside.sum() == 20
         assert not points[beside, kernels.NX : kernels.NZ + 1].any()
 
+    def test_views(self) -> None:
+        """Intensity, and depth that says -1 where nothing of the world was seen; a rendering's without background."""
+        rng = np.random.default_rng(0)
+        color, alpha, depth = (rng.random((60, 80, *more), np.float32) for more in ((3,), (), ()))
+        alpha[0, :2], depth[1, 1] = 0, 0
+        grey = color @ np.array([0.299, 0.587, 0.114], np.float32)
+        planar = torch.from_numpy(np.ascontiguousarray(color.transpose(2, 0, 1))).permute(1, 2, 0)  # as it is drawn
+        np.testing.assert_allclose(luma(torch.from_numpy(color)), grey, rtol=1e-6)
+        np.testing.assert_allclose(luma(planar), grey, rtol=1e-6)
+
+        frame = replace(Room().frame(), color=torch.from_numpy(color), depth=torch.from_numpy(depth))
+        intensity, marked = live_view(replace(frame, valid=torch.from_numpy(alpha > 0.5)))
+        np.testing.assert_allclose(intensity, grey, rtol=1e-6)
+        np.testing.assert_array_equal(marked, np.where(alpha > 0.5, depth, -1))
+
+        seen = replace(frame, color=planar, valid=torch.ones(60, 80, dtype=torch.bool))
+        intensity, marked = rendered_view(rendering_of(seen, alpha=torch.from_numpy(alpha)), 0.5)
+        np.testing.assert_allclose(intensity[alpha > 1e-3], grey[alpha > 1e-3], rtol=1e-5)
+        assert not intensity[0, :2].any()
+        np.testing.assert_allclose(marked, np.where(alpha > 0.5, depth, -1), rtol=1e-6)
+
     def test_halved_pictures(self) -> None:
         image = np.arange(35, dtype=np.float32).reshape(5, 7)  # the odd row and column fall off
-        np.testing.assert_allclose(kernels.halved_intensity(image), [[4, 6, 8], [18, 20, 22]])
+        np.testing.assert_allclose(halved(image), [[4, 6, 8], [18, 20, 22]])
 
     @pytest.mark.parametrize(
         ("readings", "expected"),
@@ -184,7 +207,28 @@ class TestKernels:
     )
     def test_halved_depth(self, readings: list[float], expected: float) -> None:
         depth = np.array(readings, np.float32).reshape(2, 2)
-        assert kernels.halved_depth(depth).item() == pytest.approx(expected, rel=1e-6)
+        assert halved_depth(depth).item() == pytest.approx(expected, rel=1e-6)
+
+    @pytest.mark.parametrize("size", [(5, 3), (4, 34), (37, 75)])
+    def test_halved_depth_of_any_size(self, size: tuple[int, int]) -> None:
+        rng = np.random.default_rng(0)
+        depth = rng.choice(np.array([-1, 0, 1, 1.01, 1.02, 2, 2.5], np.float32), size, p=(0.02, 0.2, *[0.156] * 5))
+        expected = np.zeros((size[0] // 2, size[1] // 2))
+        for y, x in np.ndindex(expected.shape):
+            four = depth[2 * y : 2 * y + 2, 2 * x : 2 * x + 2]
+            readings = four[four > 0]
+            if four.min() < 0:
+                expected[y, x] = -1
+            elif readings.size:
+                expected[y, x] = readings[readings < readings.min() * 1.03].mean()
+        np.testing.assert_allclose(halved_depth(depth), expected, rtol=1e-6)
+
+    @pytest.mark.parametrize("size", [(3, 3), (5, 18), (37, 75)])
+    def test_live_images_of_any_size(self, size: tuple[int, int]) -> None:
+        image, depth = (np.random.default_rng(seed).random(size, np.float32) for seed in (0, 1))
+        dv, du = np.gradient(image)
+        expected = np.stack((image, du, dv, depth), axis=-1)[1:-1, 1:-1]
+        np.testing.assert_allclose(live_image(image, depth)[1:-1, 1:-1], expected, atol=1e-6)
 
 
 T_NEAR = pose(0.02, -0.015, 0.015, degrees=(1.0, -1.4, 1.0))

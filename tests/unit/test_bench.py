@@ -21,11 +21,12 @@ from tcgsplat.cli.bench.limit import Machine, Needs, floors
 from tcgsplat.cli.main import main
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.render.numba_cpu import NumbaRasterizer
+from tcgsplat.render.conventions import MIN_ALPHA, MIN_TRANSMITTANCE
 from tcgsplat.render.numba_cpu.layout import from_blocks
 from tcgsplat.render.numba_cpu.passes import Passes
+from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer
 from tcgsplat.render.numba_cpu.workers import Workers
-from tcgsplat.render.protocol import MIN_ALPHA, MIN_TRANSMITTANCE, Splats
+from tcgsplat.render.protocol import Splats
 from tcgsplat.render.reference import project
 from tcgsplat.scene.trajectory import format_tum
 

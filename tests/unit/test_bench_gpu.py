@@ -14,7 +14,7 @@ from tcgsplat.cli.bench.render import Size, Times
 from tcgsplat.cli.main import main
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.render.numba_cpu import NumbaRasterizer
+from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer
 from tcgsplat.render.protocol import Splats
 
 SMALL = Size(80, 60, 1500)

@@ -1,18 +1,21 @@
 """Compiled kernels are kept until one of the sources changes, even one of another file."""
 
 import importlib.util
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+from tcgsplat.cli.kernels import MODULES
 from tcgsplat.render.numba_cpu import compilation
 
-MODULE = """
-from numba import njit
-from tcgsplat.render.numba_cpu.compilation import kept
-from tcgsplat.render.numba_cpu.simd import KERNEL
+ONE_KERNEL = """
+from tcgsplat.render.numba_cpu.compilation import kernel
 
-@kept(njit(**KERNEL))
+@kernel("i8")
 def double(x):
     return 2 * x
 """
@@ -30,7 +33,7 @@ def compiled_anew(path: Path) -> bool:
 
 def test_kernels_are_kept_until_a_source_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = tmp_path / "some_kernels.py"
-    path.write_text(MODULE)
+    path.write_text(ONE_KERNEL)
     assert compiled_anew(path)
     assert not compiled_anew(path)
     monkeypatch.setattr(compilation, "_SOURCES", "others")
@@ -42,9 +45,10 @@ def test_kernels_are_kept_until_a_source_changes(tmp_path: Path, monkeypatch: py
     "source",
     [
         "render/numba_cpu/simd.py",
-        "render/protocol.py",
+        "render/conventions.py",
         "mapping/loss_kernels.py",
-        "mapping/optimizer.py",
+        "mapping/adam.py",
+        "scene/harmonics.py",
         "tracking/alignment_kernels.py",
     ],
 )
@@ -57,3 +61,61 @@ def test_every_source_counts(source: str, tmp_path: Path, monkeypatch: pytest.Mo
         file.write_text(text)
         digests.append(compilation._digest())
     assert len(set(digests)) == 3
+
+
+RUN = """
+import json
+from tcgsplat.cli.kernels import MODULES, compile_kernels
+from tcgsplat.config import SlamConfig
+from tcgsplat.render.backends import open_rasterizer
+from tcgsplat.cli.kernels import MODULES
+from tcgsplat.render.numba_cpu import compilation
+
+kernels = compilation.kernels_of(MODULES)
+compile_kernels(SlamConfig(), open_rasterizer("numba"))
+uses = {kernel.name: (kernel.dispatcher.types, kernel.dispatcher.signatures, kernel.kept) for kernel in kernels}
+print(json.dumps({name: [[str(s) for s in signatures] == [str(types)], kept]
+    for name, (types, signatures, kept) in uses.items()}))
+"""
+
+
+def test_a_run_uses_every_kernel_with_the_types_that_it_declares_and_no_others(tmp_path: Path):
+    """In a process of its own with nothing compiled before, so that several compile them."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", RUN], env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    kernels = json.loads(done.stdout.splitlines()[-1])
+    assert len(kernels) > 10
+    assert [name for name, (as_declared, kept) in kernels.items() if not (as_declared and kept)] == []
+
+
+def test_kernels_need_no_torch():
+    """Importing it takes longer than a helping process has to compile."""
+    source = f"import sys; from tcgsplat.render.numba_cpu.compilation import kernels_of; kernels_of({MODULES!r})"
+    command = [sys.executable, "-c", source + "; print('torch' in sys.modules)"]
+    assert subprocess.run(command, capture_output=True, text=True, timeout=60).stdout == "False\n"
+
+
+TWO_KERNELS = (
+    ONE_KERNEL
+    + """
+@kernel("f8")
+def triple(x):
+    return 3 * x
+"""
+)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_processes_compile_side_by_side_and_one_may_die(fails: bool, tmp_path: Path):
+    text = TWO_KERNELS + ("import os, sys\nif 'main' not in sys.argv: os._exit(1)\n" if fails else "")
+    (tmp_path / "some_kernels.py").write_text(text)
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+    source = (
+        "from tcgsplat.render.numba_cpu import compilation as c; k = c.kernels_of(['some_kernels']);"
+        "c.compile_missing(k, 3); before = [x.kept for x in k];"
+        "print(all(before), k[0].dispatcher(2), k[1].dispatcher(2.0), [x.kept for x in k])"
+    )
+    command = [sys.executable, "-c", source, "main"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout == f"{not fails} 4 6.0 [True, True]\n", done.stderr

@@ -21,7 +21,7 @@ from tcgsplat.mapping.mapper import Grown, Mapped, Mapper
 from tcgsplat.mapping.memory import LEAST, MemoryLimit, most_useful, paged
 from tcgsplat.mapping.seeding import IdSource, SeedingConfig
 from tcgsplat.mapping.settings import MapperConfig
-from tcgsplat.render.numba_cpu import NumbaRasterizer
+from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.slam import Slam

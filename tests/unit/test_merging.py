@@ -21,7 +21,7 @@ from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import Rendering, render_view
 from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.exposure import UNCHANGED, Exposure
-from tcgsplat.scene.gaussians import SH_C0
+from tcgsplat.scene.harmonics import SH_C0
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory
 from tcgsplat.storage.run_directory import RunDirectory

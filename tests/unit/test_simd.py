@@ -4,22 +4,25 @@ import numpy as np
 import pytest
 from numba import njit
 
-from tcgsplat.render.numba_cpu import simd
+from tcgsplat.render.numba_cpu import lanes, simd
+from tcgsplat.render.numba_cpu.compilation import FLAGS
+
+_compiled = njit(fastmath=set(FLAGS))
 
 
-@njit(fastmath=simd.MATH)
+@_compiled
 def _arithmetic(a, b, out):
-    x, y = simd.load(a, 0), simd.load(b, 0)
-    simd.store(out, 0, x + y)
-    simd.store(out, 16, x - y * np.float32(2))
-    simd.store(out, 32, 3 * x / y)
-    simd.store(out, 48, simd.fma(x, y, simd.spread(np.float32(1))))
-    simd.store(out, 64, simd.minimum(x, y))
-    simd.store(out, 80, simd.maximum(x, y))
-    simd.store(out, 96, simd.where_ge(x, y, x, simd.spread(np.float32(-7))))
-    simd.store(out, 112, simd.sqrt(y))
-    simd.store(out, 128, simd.floor(x))
-    return simd.mask_ge(x, y), simd.sum_lanes(x)
+    x, y = lanes.load(a, 0), lanes.load(b, 0)
+    lanes.store(out, 0, x + y)
+    lanes.store(out, 16, x - y * np.float32(2))
+    lanes.store(out, 32, 3 * x / y)
+    lanes.store(out, 48, simd.fma(x, y, simd.spread(np.float32(1))))
+    lanes.store(out, 64, simd.minimum(x, y))
+    lanes.store(out, 80, simd.maximum(x, y))
+    lanes.store(out, 96, simd.where_ge(x, y, x, simd.spread(np.float32(-7))))
+    lanes.store(out, 112, simd.sqrt(y))
+    lanes.store(out, 128, simd.floor(x))
+    return lanes.mask_ge(x, y), lanes.sum_lanes(x)
 
 
 def test_arithmetic_is_lane_by_lane():
@@ -36,10 +39,10 @@ def test_arithmetic_is_lane_by_lane():
     assert total == pytest.approx(a.sum(), abs=1e-6)
 
 
-@njit(fastmath=simd.MATH)
+@_compiled
 def _exp2(a, out):
     for i in range(0, a.size, 16):
-        simd.store(out, i, simd.exp2(simd.load(a, i)))
+        lanes.store(out, i, simd.exp2(lanes.load(a, i)))
 
 
 def test_exp2_is_accurate_over_the_range_that_the_kernels_use():
@@ -50,9 +53,9 @@ def test_exp2_is_accurate_over_the_range_that_the_kernels_use():
     assert relative.max() < 3e-7
 
 
-@njit(fastmath=simd.MATH)
+@_compiled
 def _sums(rows, out):
-    simd.store(out, 0, simd.lane_sums((simd.load(rows, 0), simd.load(rows, 16), simd.load(rows, 32))))
+    lanes.store(out, 0, lanes.lane_sums((lanes.load(rows, 0), lanes.load(rows, 16), lanes.load(rows, 32))))
 
 
 def test_lane_sums_puts_each_total_in_its_lane():
@@ -62,10 +65,10 @@ def test_lane_sums_puts_each_total_in_its_lane():
     np.testing.assert_array_equal(out, [*rows.reshape(3, 16).sum(1), *[0] * 13])
 
 
-@njit(fastmath=simd.MATH)
+@_compiled
 def _transpose(matrix, out):
-    simd.store_transposed(out, 0, simd.load_transposed(matrix, 0))
-    simd.store(out, 256, simd.load_transposed(matrix, 0)[3])
+    lanes.store_transposed(out, 0, lanes.load_transposed(matrix, 0))
+    lanes.store(out, 256, lanes.load_transposed(matrix, 0)[3])
 
 
 def test_transposed_load_and_store_are_inverse():
@@ -76,9 +79,9 @@ def test_transposed_load_and_store_are_inverse():
     np.testing.assert_array_equal(out[256:], matrix.reshape(16, 16)[:, 3])
 
 
-@njit
+@_compiled
 def _append(out, masks, start, bit, length):
-    return simd.append_where_bit(out, 2, masks, start, np.int32(bit), np.int32(length))
+    return lanes.append_where_bit(out, 2, masks, start, np.int32(bit), np.int32(length))
 
 
 @pytest.mark.parametrize("length", [16, 5, 0])
@@ -92,10 +95,10 @@ def test_append_where_bit_keeps_order_and_length(length):
     assert out[2 : 2 + count].tolist() == expected
 
 
-@njit
+@_compiled
 def _integers(values, out):
-    simd.store_int32_pairs(out, 0, simd.load(values, 0), simd.load(values, 0) * np.float32(2))
-    return simd.trailing_zeros(np.int32(40))
+    lanes.store_int32_pairs(out, 0, lanes.load(values, 0), lanes.load(values, 0) * np.float32(2))
+    return lanes.trailing_zeros(np.int32(40))
 
 
 def test_integers():
@@ -106,11 +109,11 @@ def test_integers():
     np.testing.assert_array_equal(out[1::2], (2 * values).astype(np.int32))
 
 
-@njit(fastmath=simd.MATH)
+@_compiled
 def _regroup(blocks, out):
-    rows = simd.regrouped(simd.load(blocks, 0), simd.load(blocks, 16), simd.load(blocks, 32), simd.load(blocks, 48))
+    rows = lanes.regrouped(*lanes.load_rows(blocks, 0, 16, 4))
     for k in range(4):
-        simd.store(out, 16 * k, rows[k])
+        lanes.store(out, 16 * k, rows[k])
 
 
 def test_regrouped_makes_rows_of_pixels_from_blocks_and_back():
@@ -121,10 +124,10 @@ def test_regrouped_makes_rows_of_pixels_from_blocks_and_back():
     np.testing.assert_array_equal(back, blocks)
 
 
-@njit(fastmath=simd.MATH)
+@_compiled
 def _log2(a, out):
     for i in range(0, a.size, 16):
-        simd.store(out, i, simd.log2(simd.load(a, i)))
+        lanes.store(out, i, simd.log2(lanes.load(a, i)))
 
 
 def test_log2_is_accurate_from_tiny_to_huge_and_near_one():
@@ -135,9 +138,9 @@ def test_log2_is_accurate_from_tiny_to_huge_and_near_one():
     assert np.all(np.abs(out - true) < 2e-7 + 1e-7 * np.abs(true))
 
 
-@njit(fastmath=simd.MATH)
+@_compiled
 def _gather(array, indices, out):
-    simd.store(out, 0, simd.gather(array, 3, simd.load(indices, 0)))
+    lanes.store(out, 0, lanes.gather(array, 3, lanes.load(indices, 0)))
 
 
 def test_gather_takes_a_value_for_every_lane():
@@ -149,10 +152,10 @@ def test_gather_takes_a_value_for_every_lane():
     np.testing.assert_array_equal(out, array[3 + indices])
 
 
-@njit(fastmath=simd.MATH)
+@_compiled
 def _squares(image, x, y, out):
-    squares = simd.gather_squares(image, 4 * image.shape[1], simd.load(x, 0), simd.load(y, 0))
-    simd.store_transposed(out, 0, squares)
+    squares = lanes.gather_squares(image, 4 * image.shape[1], lanes.load(x, 0), lanes.load(y, 0))
+    lanes.store_transposed(out, 0, squares)
 
 
 def test_gather_squares_takes_four_pixels_for_every_lane():
@@ -166,13 +169,13 @@ def test_gather_squares_takes_four_pixels_for_every_lane():
         np.testing.assert_array_equal(square, image[row : row + 2, column : column + 2])
 
 
-@njit(fastmath=simd.MATH)
+@_compiled
 def _matrices(rows, out):
-    A, B = simd.load_rows(rows, 0, 16, 9), simd.load_rows(rows, 144, 16, 9)
-    simd.store_rows(out, 0, 16, simd.product(A, B))
-    simd.store_rows(out, 144, 16, simd.transposed(A))
-    simd.store_rows(out, 288, 16, simd.times_columns(A, B[:3]))
-    simd.store_rows(out, 432, 32, (simd.dot(A[:4], B[:4]), simd.load_spread(rows, 5, 2)[1]))
+    A, B = lanes.load_rows(rows, 0, 16, 9), lanes.load_rows(rows, 144, 16, 9)
+    lanes.store_rows(out, 0, 16, simd.product(A, B))
+    lanes.store_rows(out, 144, 16, simd.transposed(A))
+    lanes.store_rows(out, 288, 16, simd.times_columns(A, B[:3]))
+    lanes.store_rows(out, 432, 32, (simd.dot(A[:4], B[:4]), lanes.load_spread(rows, 5, 2)[1]))
 
 
 def test_matrices_are_lane_by_lane():
@@ -191,10 +194,10 @@ def test_matrices_are_lane_by_lane():
     close(29, np.full(16, rows[0, 6]))
 
 
-@njit
+@_compiled
 def _copy_first(source, at, count, out):
-    simd.store_first(out, at, simd.load_first(source, at, count), count)
-    simd.store(out, 32, simd.load_first(source, at, count))
+    lanes.store_first(out, at, lanes.load_first(source, at, count), count)
+    lanes.store(out, 32, lanes.load_first(source, at, count))
 
 
 @pytest.mark.parametrize("count", [0, 5, 16])

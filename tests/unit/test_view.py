@@ -10,8 +10,9 @@ from analytic_room import CAMERA, Room, pose
 
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.render.numba_cpu import NumbaRasterizer
-from tcgsplat.render.protocol import MAX_OPACITY, Raster, Rasterizer, Splats
+from tcgsplat.render.conventions import MAX_OPACITY
+from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer
+from tcgsplat.render.protocol import Raster, Rasterizer, Splats
 from tcgsplat.render.reference import ReferenceRasterizer
 from tcgsplat.render.view import MIN_COVERAGE, Rendering, SubmapView, render, render_view
 from tcgsplat.scene.gaussians import Gaussians

@@ -44,21 +44,24 @@ def command(args: Args) -> int:  # noqa: ARG001
 def numba_finding() -> Finding:
     """The CPU backend; its kernels also work where a GPU draws, on what is done once a frame."""
     try:
-        from tcgsplat.render.numba_cpu import blending
+        from tcgsplat.cli.kernels import MODULES
+        from tcgsplat.render.numba_cpu.compilation import kernels_of
+
+        kernels = kernels_of(MODULES)
     except (ImportError, RuntimeError) as error:  # numba raises the latter where it finds no place for its cache
         advice = "set NUMBA_CACHE_DIR to a folder that can be written, or install numba again"
         return Finding("numba", False, (f"the kernels cannot be loaded: {error}; {advice}",))
     from llvmlite import binding
 
-    cache = Path(str(blending.forward.stats.cache_path))
-    compiled = any(cache.glob("blending.forward*.nbi"))
+    cache = Path(str(kernels[0].dispatcher.stats.cache_path))
+    missing = [kernel for kernel in kernels if not kernel.kept]
     place = f"compiled kernels are kept in {cache}"
     facts = (
         "the default where there is no GPU",
         "AVX-512: yes, the kernels' vectors fill its registers"
         if binding.get_host_cpu_features().get("avx512f")
         else "AVX-512: no; results are the same, more slowly; a processor with AVX-512 is faster",
-        f"{place}; {'they are there' if compiled else 'none yet: the first run takes some twenty seconds longer'}"
+        f"{place}; {'some are missing: the first run takes some seconds longer' if missing else 'they are there'}"
         if os.access(cache if cache.exists() else cache.parent, os.W_OK)
         else f"{place}, which cannot be written: every run compiles anew; set NUMBA_CACHE_DIR to another folder",
     )

@@ -1,20 +1,36 @@
 """Getting the CPU kernels compiled before the clock starts, and saying so when that takes long."""
 
+import gc
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Final
 
 import torch
 from numba.core import event
 
+from tcgsplat.cli.progress import say
 from tcgsplat.config import SlamConfig, with_settings
 from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.numba_cpu.compilation import compile_missing, kernels_of
+from tcgsplat.render.numba_cpu.workers import available_cores
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.frame import Frame
 from tcgsplat.slam import Slam
 from tcgsplat.tracking.synchronization import synchronized
 
+MODULES: Final = (
+    "tcgsplat.render.numba_cpu.pass_kernels",
+    "tcgsplat.mapping.loss_kernels",
+    "tcgsplat.mapping.native_kernels",
+    "tcgsplat.tracking.alignment_kernels",
+    "tcgsplat.mapping.seeding_kernels",
+    "tcgsplat.tracking.synchronization_kernels",
+    "tcgsplat.tracking.smoothing_kernels",
+)
+"""What a run on the CPU draws on; what takes long to compile first, so that processes finish together."""
+ANNOUNCEMENT: Final = "compiling kernels, once per machine: some seconds"
 _ONE_STEP: Final = {
     "tracker.descent.iterations": 1,
     "mapper.iterations": 1,
@@ -23,20 +39,23 @@ _ONE_STEP: Final = {
 }
 
 
-def compile_kernels(config: SlamConfig, rasterizer: Rasterizer, announce: Callable[[], object]) -> float:
-    """Have every kernel that a run needs loaded or compiled, by a throw-away run over two tiny frames.
+def compile_kernels(config: SlamConfig, rasterizer: Rasterizer) -> float:
+    """Have every kernel that a run needs compiled or loaded, the rest by a throw-away run over two tiny frames.
+
+    Says so on standard error if something has to be compiled, before that is done.
 
     Args:
         config: Settings of the run to come.
         rasterizer: Its backend.
-        announce: Called once if something has to be compiled, before that is done.
 
     Returns:
-        Seconds that it took: a fraction of one where the kernels come from numba's cache.
+        Seconds that it took: a fraction of one where the kernels are on disk.
     """
     started = time.perf_counter()
-    slam = Slam(with_settings(config, _ONE_STEP), rasterizer)
-    with _heard_compiling(announce):
+    with _heard_compiling(partial(say, ANNOUNCEMENT)), _uncollected():
+        if rasterizer.name == "numba":
+            compile_missing([kernel for kernel in kernels_of(MODULES) if not kernel.kept], available_cores())
+        slam = Slam(with_settings(config, _ONE_STEP), rasterizer)
         for index in range(2):
             slam.step(_wall(index))
         synchronized(_wall(2), torch.full((6,), 0.5, dtype=torch.float64))  # the wall stands still, so no step did
@@ -84,3 +103,15 @@ def _heard_compiling(announce: Callable[[], object]) -> Iterator[None]:
         yield
     finally:
         event.unregister("numba:compile", listener)  # type: ignore[no-untyped-call]
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Without the collector of garbage: it looks at every object of torch's again while the compiler makes more."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()

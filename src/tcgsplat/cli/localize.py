@@ -47,7 +47,6 @@ def command(args: Args) -> int:
     from tcgsplat.cli.interrupt import stopping_on_interrupt
     from tcgsplat.cli.kernels import compile_kernels
     from tcgsplat.cli.pictures import frames_of, relocalizer
-    from tcgsplat.cli.progress import say
     from tcgsplat.config import from_toml
     from tcgsplat.render.backends import open_rasterizer
     from tcgsplat.scene.trajectory import format_tum
@@ -64,7 +63,7 @@ def command(args: Args) -> int:
     frames = frames_of(run, args.images, args.start, args.stride, args.limit)
     torch.set_num_threads(1)  # as in a run: the kernels have threads of their own
     config = from_toml(run.config_toml)
-    compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
+    compile_kernels(config, rasterizer)
     known, (_, atlas) = relocalizer(run, rasterizer), run.trajectory()
     stamps, poses, total = [], [], 0
     with stopping_on_interrupt() as stop:

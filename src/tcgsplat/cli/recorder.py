@@ -141,9 +141,7 @@ def recorded(
     # A frame's arrays are small: handing an operation to a second thread costs more than it saves, measured 141 against
     # 104 ms a frame, and the splat kernels have threads of their own.
     torch.set_num_threads(1)
-    compiling = compile_kernels(
-        config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds")
-    )
+    compiling = compile_kernels(config, rasterizer)
     checkpoint = run.checkpoint()
     if checkpoint is None:
         slam = Slam(config, rasterizer, live=realtime, store=run)

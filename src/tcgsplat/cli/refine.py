@@ -49,7 +49,7 @@ def command(args: Args) -> int:
     config = from_toml(run.config_toml)
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     torch.set_num_threads(1)  # as in a run: the kernels have threads of their own
-    compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
+    compile_kernels(config, rasterizer)
     say(f"merging {run.submap_count} submaps")
     merged = newly_merged(run, rasterizer)
     sys.stdout.write(f"{len(merged.T_world_map)} submaps merged: {len(merged.submap)} Gaussians\n")

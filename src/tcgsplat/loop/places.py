@@ -16,7 +16,8 @@ from tcgsplat.loop.localization import relative_pose
 from tcgsplat.loop.retrieval import Candidate
 from tcgsplat.loop.settings import LoopConfig
 from tcgsplat.loop.viewpoints import view_confidence, viewpoints
-from tcgsplat.render.protocol import NEAR_PLANE, Rasterizer
+from tcgsplat.render.conventions import NEAR_PLANE
+from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import SubmapView
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Keyframe, Submap

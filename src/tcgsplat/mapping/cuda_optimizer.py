@@ -6,7 +6,8 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from tcgsplat.mapping.optimizer import BETA_1, BETA_2, EPSILON, HIGHER_HARMONICS, LearningRates, RowAdam
+from tcgsplat.mapping.adam import BETA_1, BETA_2, EPSILON
+from tcgsplat.mapping.optimizer import HIGHER_HARMONICS, LearningRates, RowAdam
 from tcgsplat.render.cuda.launching import THREADS, Compiled, Kernels, source
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag

@@ -22,10 +22,12 @@ from tcgsplat.geometry import se3
 from tcgsplat.mapping.brightness import exposures_of
 from tcgsplat.mapping.fields import Fields
 from tcgsplat.mapping.settings import MapperConfig
-from tcgsplat.render.protocol import NEAR_PLANE, Rasterizer
+from tcgsplat.render.conventions import NEAR_PLANE
+from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import SubmapView
 from tcgsplat.scene.exposure import Exposure
-from tcgsplat.scene.gaussians import SH_C0, Gaussians
+from tcgsplat.scene.gaussians import Gaussians
+from tcgsplat.scene.harmonics import SH_C0
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag, Pose
 

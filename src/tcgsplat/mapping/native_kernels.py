@@ -5,31 +5,32 @@ Parameters are in blocks [blocks, ROWS, 16] like the rasterizer's own, and in th
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
-from tcgsplat.mapping.optimizer import BETA_1, BETA_2, EPSILON
-from tcgsplat.render.numba_cpu.compilation import kept
+from tcgsplat.mapping.adam import BETA_1, BETA_2, EPSILON
+from tcgsplat.render.conventions import MAX_OPACITY
+from tcgsplat.render.numba_cpu.compilation import inner, kernel
+from tcgsplat.render.numba_cpu.lanes import load, load_rows, mask_ge, store, store_rows
 from tcgsplat.render.numba_cpu.layout import FEATURE, LOG2_OPACITY, MEAN, PARAMETERS, QUAT, SCALE
-from tcgsplat.render.numba_cpu.phases import WAITING, next_unit
+from tcgsplat.render.numba_cpu.phases import BEGIN, DONE, WAITING, next_unit
 from tcgsplat.render.numba_cpu.simd import (
-    INNER,
-    KERNEL,
+    Vector,
+    Vectors,
+    apart,
+    dot,
     exp2,
     fma,
-    load,
+    formula,
     log2,
-    mask_ge,
     maximum,
     minimum,
     spread,
     sqrt,
-    store,
     where_ge,
 )
-from tcgsplat.render.protocol import MAX_OPACITY
-from tcgsplat.scene.gaussians import SH_C0
+from tcgsplat.scene.harmonics import SH_C0
 
 # Rows of the raw parameters; the same places as their activations have in the rasterizer's blocks.
 LOG_SCALE, LOGIT, SH = SCALE, LOG2_OPACITY, FEATURE
@@ -39,6 +40,7 @@ ROWS = SH + 3
 SCALE_WEIGHT, ROTATION_WEIGHT, STABILITY_WEIGHT = ROWS, ROWS + 1, ROWS + 2
 CONSTANTS = ROWS + 3
 
+_ONLY_PHASE = np.int64(0)
 UNIT = 2048
 """Gaussians that a thread takes at a time."""
 
@@ -55,54 +57,119 @@ _REST_1, _REST_2 = np.float32(1 - BETA_1), np.float32(1 - BETA_2)
 _TINY = np.float32(1e-24)
 
 
-@kept(njit(**KERNEL))
+@formula
+def _opacity(logit: Vector) -> Vector:
+    """log2 of the clipped sigmoid."""
+    logit = maximum(minimum(logit, logit.of(_STEEPEST)), logit.of(-_STEEPEST))
+    return minimum(0 - log2(exp2(logit * -_LOG2E) + _ONE), logit.of(_LOG2_MAX_OPACITY))
+
+
+@formula
+def _scale(log_scale: Vector) -> Vector:
+    return exp2(log_scale * _LOG2E)
+
+
+@formula
+def _color(sh: Vector) -> Vector:
+    return maximum(fma(sh, sh.of(_C0), sh.of(_HALF)), sh.of(_ZERO))
+
+
+@kernel("f4[::1], f4[::1], i8, i8")
 def activate(raw, P, start, stop):
     """The rasterizer's parameters from raw ones, for a range: what `Gaussians` calls scales, opacities and colors."""
     for i in range(start, stop, 16):
         for row in range(MEAN, QUAT + 4):
             store(P, PARAMETERS * i + 16 * row, load(raw, ROWS * i + 16 * row))
         for row in range(LOG_SCALE, LOG_SCALE + 3):
-            store(P, PARAMETERS * i + 16 * row, exp2(load(raw, ROWS * i + 16 * row) * _LOG2E))
-        logit = maximum(minimum(load(raw, ROWS * i + 16 * LOGIT), spread(_STEEPEST)), spread(-_STEEPEST))
-        opacity = spread(_ZERO) - log2(exp2(logit * (-_LOG2E)) + _ONE)
-        store(P, PARAMETERS * i + 16 * LOGIT, minimum(opacity, spread(_LOG2_MAX_OPACITY)))
+            store(P, PARAMETERS * i + 16 * row, _scale(load(raw, ROWS * i + 16 * row)))
+        store(P, PARAMETERS * i + 16 * LOGIT, _opacity(load(raw, ROWS * i + 16 * LOGIT)))
         for row in range(SH, SH + 3):
-            store(P, PARAMETERS * i + 16 * row, maximum(fma(load(raw, ROWS * i + 16 * row), spread(_C0), spread(_HALF)), spread(_ZERO)))
+            store(P, PARAMETERS * i + 16 * row, _color(load(raw, ROWS * i + 16 * row)))
 
 
-@kept(njit(**INNER))
-def _changes(raw, before, i):
-    """Of sixteen Gaussians: d_mu (Eq. 5), d_s (Eq. 6), the cosine between quaternions, and their inverse lengths."""
-    one, moved, stretched = spread(_ONE), spread(_ZERO), spread(_ZERO)
-    for k in range(3):
-        d = load(raw, ROWS * i + 16 * (MEAN + k)) - load(before, ROWS * i + 16 * (MEAN + k))
-        moved = fma(d, d, moved)
-        d = load(raw, ROWS * i + 16 * (LOG_SCALE + k)) - load(before, ROWS * i + 16 * (LOG_SCALE + k))
-        stretched = fma(d, d, stretched)
-    product, length, length_before = spread(_ZERO), spread(_TINY), spread(_TINY)
-    for k in range(4):
-        q, q0 = load(raw, ROWS * i + 16 * (QUAT + k)), load(before, ROWS * i + 16 * (QUAT + k))
-        product, length, length_before = fma(q, q0, product), fma(q, q, length), fma(q0, q0, length_before)
-    inverse, inverse_before = one / sqrt(length), one / sqrt(length_before)
-    return sqrt(moved), sqrt(stretched), product * inverse * inverse_before, inverse, inverse_before
+@formula
+def _changes(raw: Vectors, before: Vectors) -> Vectors:
+    """Of rows up to the scales: d_mu (Eq. 5), d_s (Eq. 6), the cosine between quaternions, and their inverse lengths."""
+
+    def length(rows: slice) -> Vector:
+        return _norm([now - then for now, then in zip(raw[rows], before[rows], strict=True)], 0)
+
+    q, q_before = raw[QUAT:LOG_SCALE], before[QUAT:LOG_SCALE]
+    inverse, inverse_before = _ONE / _norm(q, _TINY), _ONE / _norm(q_before, _TINY)
+    cosine = dot(q, q_before) * inverse * inverse_before
+    return length(slice(MEAN, QUAT)), length(slice(LOG_SCALE, LOGIT)), cosine, inverse, inverse_before
 
 
-@kept(njit(**INNER))
-def _distance(moved, stretched, cosine, constants):
+def _norm(a: Sequence[Vector], least_square: float) -> Vector:
+    total = a[0].of(least_square)
+    for entry in a:
+        total = fma(entry, entry, total)
+    return sqrt(total)
+
+
+@formula
+def _distance(changes: Vectors, scale_weight: Vector, rotation_weight: Vector) -> Vector:
     """Eq. 8."""
-    turned = maximum(spread(_ONE) - cosine * cosine, spread(_ZERO))
-    return fma(turned, spread(constants[ROTATION_WEIGHT]), fma(stretched, spread(constants[SCALE_WEIGHT]), moved))
+    moved, stretched, cosine, _, _ = changes
+    turned = maximum(_ONE - cosine * cosine, cosine.of(_ZERO))
+    return fma(turned, rotation_weight, fma(stretched, scale_weight, moved))
 
 
-@kept(njit(**KERNEL))
+@kernel("f4[::1], f4[::1], i8, f4[::1], f4[::1]")
 def self_distances(raw, before, n, constants, out):
     """How far each Gaussian is from where it was before the update (Eq. 8), metres."""
     for i in range(0, n, 16):
-        moved, stretched, cosine, _, _ = _changes(raw, before, i)
-        store(out, i, _distance(moved, stretched, cosine, constants))
+        changes = _changes(load_rows(raw, ROWS * i, 16, LOGIT), load_rows(before, ROWS * i, 16, LOGIT))
+        store(out, i, _distance(changes, constants[SCALE_WEIGHT], constants[ROTATION_WEIGHT]))
 
 
-@kept(njit(**INNER))
+@formula
+def _pull(
+    changes: Vectors, limit: Vector, seen: Vector, scale_weight: Vector, rotation_weight: Vector, weight: Vector
+) -> Vectors:
+    """What exceeds the limit of Eq. 23, and factors of its derivative by means, quaternions and scales."""
+    moved, stretched, cosine, inverse, _ = changes
+    distance, zero, tiny = _distance(changes, scale_weight, rotation_weight), seen.of(_ZERO), seen.of(_TINY)
+    pull = where_ge(limit, distance, zero, weight)
+    by_mean = where_ge(zero, moved, zero, pull / maximum(moved, tiny))
+    by_scale = where_ge(zero, stretched, zero, pull * scale_weight / maximum(stretched, tiny))
+    by_turn = pull * rotation_weight * cosine * inverse * _TWO
+    return where_ge(limit, distance, zero, distance - limit) * seen, by_mean, by_turn, by_scale
+
+
+@formula
+def _aged(clocks: Vectors, seen: Vector) -> tuple[Vectors, Vectors]:
+    """The clocks after this step, and what the moments of a young Gaussian are multiplied by."""
+    power_1, power_2 = powers = clocks[0] * _BETA_1, clocks[1] * _BETA_2
+    after = tuple(where_ge(seen, seen.of(_ONE), now, then) for now, then in zip(powers, clocks, strict=True))
+    return after, (_ONE / (_ONE - power_1), _ONE / (_ONE - power_2))
+
+
+@formula
+def _by_logit(value: Vector, g: Vector, log2_opacity: Vector) -> Vector:
+    """D log2 sigmoid(x) = (1 - sigmoid(x)) log2(e) dx; where opacity is clipped, nothing."""
+    return where_ge(value, value.of(_MAX_LOGIT), value.of(_ZERO), g * (_ONE - exp2(log2_opacity)) * _LOG2E)
+
+
+@formula
+def _by_color(g: Vector, color: Vector) -> Vector:
+    """Nothing where colour is clipped."""
+    return where_ge(g.of(_ZERO), color, g.of(_ZERO), g * _C0)
+
+
+@formula
+def _stepped(
+    value: Vector, g: Vector, first: Vector, second: Vector, young: Vectors, rate: Vector, seen: Vector
+) -> Vectors:
+    """Adam for one row: the value and its two moments after a step, or as they are if not seen."""
+    g = where_ge(g.of(_HUGE), apart(g, g.of(0)), g, g.of(0))  # NaN compares as false
+    m = fma(first, g.of(_BETA_1), g * _REST_1)
+    v = fma(second, g.of(_BETA_2), g * g * _REST_2)
+    after = value - m * young[0] / (sqrt(v * young[1]) + _EPSILON) * rate, m, v
+    return tuple(where_ge(seen, g.of(_ONE), new, old) for new, old in zip(after, (value, first, second), strict=True))
+
+
+@inner
 def _adam_step(start, stop, raw, P, before, first, second, clocks, grads, depths, allowed, scale, constants, excess):
     """One Adam step of the visible Gaussians of a range, on the losses of the pixels and of Eq. 23.
 
@@ -118,25 +185,19 @@ def _adam_step(start, stop, raw, P, before, first, second, clocks, grads, depths
         if mask_ge(seen, one) == 0:
             store(excess, i, zero)
             continue
-        power_1, power_2 = load(clocks, 2 * i) * _BETA_1, load(clocks, 2 * i + 16) * _BETA_2
-        store(clocks, 2 * i, where_ge(seen, one, power_1, load(clocks, 2 * i)))
-        store(clocks, 2 * i + 16, where_ge(seen, one, power_2, load(clocks, 2 * i + 16)))
-        young_1, young_2 = one / (one - power_1), one / (one - power_2)
-        geometry = load(scale, i)
-
+        after, young = _aged(load_rows(clocks, 2 * i, 16, 2), seen)
+        store_rows(clocks, 2 * i, 16, after)
         # Eq. 8 between now and before the update, and where it exceeds what is allowed, its derivative.
-        moved, stretched, cosine, inverse, inverse_before = _changes(raw, before, i)
-        distance = _distance(moved, stretched, cosine, constants)
-        limit = load(allowed, i)
-        store(excess, i, where_ge(limit, distance, zero, distance - limit) * seen)
-        pull = where_ge(limit, distance, zero, spread(constants[STABILITY_WEIGHT]))
-        by_mean = where_ge(zero, moved, zero, pull / maximum(moved, spread(_TINY)))
-        by_scale = where_ge(zero, stretched, zero, pull * constants[SCALE_WEIGHT] / maximum(stretched, spread(_TINY)))
-        by_turn = pull * constants[ROTATION_WEIGHT] * cosine * inverse * _TWO
-
+        changes = _changes(load_rows(raw, ROWS * i, 16, LOGIT), load_rows(before, ROWS * i, 16, LOGIT))
+        exceeds, by_mean, by_turn, by_scale = _pull(
+            changes, load(allowed, i), seen, constants[SCALE_WEIGHT], constants[ROTATION_WEIGHT],
+            constants[STABILITY_WEIGHT],
+        )  # fmt: skip
+        store(excess, i, exceeds)
+        _, _, cosine, inverse, inverse_before = changes
         for row in range(ROWS):
             at, at_P = ROWS * i + 16 * row, PARAMETERS * i + 16 * row
-            value, g = load(raw, at), load(grads, at_P)
+            value, g, rate = load(raw, at), load(grads, at_P), spread(constants[row])
             if row < QUAT:
                 g = fma(by_mean, value - load(before, at), g)
             elif row < LOG_SCALE:
@@ -144,33 +205,29 @@ def _adam_step(start, stop, raw, P, before, first, second, clocks, grads, depths
             elif row < LOGIT:
                 g = fma(by_scale, value - load(before, at), g * load(P, at_P))
             elif row == LOGIT:
-                # d log2 sigmoid(x) = (1 - sigmoid(x)) log2(e) dx; where opacity is clipped, nothing.
-                g = where_ge(value, spread(_MAX_LOGIT), zero, g * (one - exp2(load(P, at_P))) * _LOG2E)
+                g = _by_logit(value, g, load(P, at_P))
             else:
-                g = where_ge(zero, load(P, at_P), zero, g * _C0)
-            g = where_ge(spread(_HUGE), maximum(g, zero - g), g, zero)  # NaN compares as false
-            m = fma(load(first, at), spread(_BETA_1), g * _REST_1)
-            v = fma(load(second, at), spread(_BETA_2), g * g * _REST_2)
-            step = m * young_1 / (sqrt(v * young_2) + _EPSILON) * constants[row]
+                g = _by_color(g, load(P, at_P))
             if row < LOGIT:
-                step = step * geometry
-            store(first, at, where_ge(seen, one, m, load(first, at)))
-            store(second, at, where_ge(seen, one, v, load(second, at)))
-            store(raw, at, where_ge(seen, one, value - step, value))
+                rate = rate * load(scale, i)
+            value, m, v = _stepped(value, g, load(first, at), load(second, at), young, rate, seen)
+            store(first, at, m)
+            store(second, at, v)
+            store(raw, at, value)
         activate(raw, P, i, i + 16)
 
 
-@kept(njit(**KERNEL))
+@kernel("i8[::1], i8, f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1]")
 def adam_step(
     progress, n, raw, P, before, first, second, clocks, grads, depths, allowed, scale, constants, excess
 ):
     """`_adam_step` for all Gaussians, shared by threads in units. False: has waited for long."""
     units = -(-n // UNIT)
-    k = next_unit(progress, 0, units, 0)
+    k = next_unit(progress, _ONLY_PHASE, units, BEGIN)
     while k >= 0:
         _adam_step(
             k * UNIT, min((k + 1) * UNIT, n), raw, P, before, first, second, clocks, grads, depths, allowed, scale,
             constants, excess,
         )
-        k = next_unit(progress, 0, units, 1)
+        k = next_unit(progress, _ONLY_PHASE, units, DONE)
     return k != WAITING

@@ -56,7 +56,7 @@ def begin(submap: Submap, config: MapperConfig, confidence: ConfidenceConfig, ra
     """The fastest optimisation that the rasterizer and the settings allow."""
     if rasterizer.name == "numba":  # what knows numba takes its time to import
         from tcgsplat.mapping.native_optimization import NativeOptimization, covers  # noqa: PLC0415
-        from tcgsplat.render.numba_cpu import NumbaRasterizer  # noqa: PLC0415
+        from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer  # noqa: PLC0415
 
         if isinstance(rasterizer, NumbaRasterizer) and covers(submap, config, confidence):
             return NativeOptimization(submap, config, confidence, rasterizer.passes)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from tcgsplat.mapping.adam import BETA_1, BETA_2, EPSILON
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag
 
@@ -32,7 +33,6 @@ class LearningRates:
     (base: 2.5e-3)"""
 
 
-BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 HIGHER_HARMONICS = 0.05
 """Of the constant one's rate. [base]"""
 

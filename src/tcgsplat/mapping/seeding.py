@@ -20,7 +20,8 @@ from tcgsplat.geometry.camera import Camera
 from tcgsplat.mapping.seeding_kernels import normals_at
 from tcgsplat.render.view import Rendering
 from tcgsplat.scene.frame import Frame
-from tcgsplat.scene.gaussians import SH_C0, Gaussians
+from tcgsplat.scene.gaussians import Gaussians
+from tcgsplat.scene.harmonics import SH_C0
 from tcgsplat.tensors import Mask, Plane, Pose
 
 
@@ -82,10 +83,12 @@ class IdSource:
 
 def surface_normals(depth: Plane, camera: Camera, chosen: Mask) -> Float[Tensor, "n 3"]:
     """Unit normals of a depth image at the chosen pixels, row by row, in the camera frame; see `normals_at`."""
-    rows, columns = np.nonzero(chosen.numpy())
+    rows, columns = (np.ascontiguousarray(at) for at in np.nonzero(chosen.numpy()))
     rays_x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
     rays_y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
-    return torch.from_numpy(normals_at(np.ascontiguousarray(depth.numpy()), rows, columns, rays_x, rays_y))
+    normals = np.empty((rows.size, 3), np.float32)
+    normals_at(np.ascontiguousarray(depth.numpy()), rows, columns, rays_x, rays_y, normals)
+    return torch.from_numpy(normals)
 
 
 def needed(frame: Frame, rendering: Rendering | None, config: SeedingConfig) -> Mask:

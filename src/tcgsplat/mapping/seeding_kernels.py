@@ -1,13 +1,14 @@
 """Surface normals at chosen pixels of a depth image."""
 
 import numpy as np
-from numba import njit
+
+from tcgsplat.render.numba_cpu.compilation import inner, kernel
 
 _WINDOW = 2
 _SAME_SURFACE, _LEAST_FACING = np.float32(0.03), np.float32(0.15)
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
+@inner
 def _smoothed(depth, x, y, rays_x, rays_y):  # type: ignore[no-untyped-def]
     """Mean point of the readings around a pixel; its own point where that is on another surface."""
     h, w = depth.shape
@@ -27,9 +28,9 @@ def _smoothed(depth, x, y, rays_x, rays_y):  # type: ignore[no-untyped-def]
     return rays_x[x] * z, rays_y[y] * z, z
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
-def normals_at(depth, rows, columns, rays_x, rays_y):  # type: ignore[no-untyped-def]
-    """Unit normals [n, 3] in the camera frame, towards the camera; the viewing ray's where unknown.
+@kernel("f4[:, ::1], i8[::1], i8[::1], f4[::1], f4[::1], f4[:, ::1]")
+def normals_at(depth, rows, columns, rays_x, rays_y, normals):  # type: ignore[no-untyped-def]
+    """Unit `normals` [n, 3] in the camera frame, towards the camera; the viewing ray's where unknown.
 
     `rays_x[u]` and `rays_y[v]` are the slopes (u - cx) / fx and (v - cy) / fy. Points are averaged over 5 x 5 readings
     first, where that moves them by less than 3 % of the depth: noise is an order larger than the slope between two
@@ -37,7 +38,6 @@ def normals_at(depth, rows, columns, rays_x, rays_y):  # type: ignore[no-untyped
     its points. A normal needs readings at all of its eight neighbours, and a surface that is not edge-on.
     """
     h, w = depth.shape
-    normals = np.empty((rows.size, 3), np.float32)
     for i in range(rows.size):
         y, x = rows[i], columns[i]
         rx, ry = rays_x[x], rays_y[y]
@@ -62,4 +62,3 @@ def normals_at(depth, rows, columns, rays_x, rays_y):  # type: ignore[no-untyped
         facing = nx * normals[i, 0] + ny * normals[i, 1] + nz * normals[i, 2]
         if facing > _LEAST_FACING * length:
             normals[i, 0], normals[i, 1], normals[i, 2] = nx / length, ny / length, nz / length
-    return normals

@@ -32,7 +32,7 @@ def open_rasterizer(name: BackendName = "auto") -> Rasterizer:
     if name in ("cuda", "gsplat"):
         return _on_gpu(name)
     if name in ("auto", "numba"):
-        from tcgsplat.render.numba_cpu import NumbaRasterizer  # noqa: PLC0415  numba takes its time to import
+        from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer  # noqa: PLC0415  numba takes its time to import
 
         return NumbaRasterizer()
     if name == "reference":

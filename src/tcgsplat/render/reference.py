@@ -13,15 +13,8 @@ from torch import Tensor
 
 from tcgsplat.geometry import quaternion
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.render.protocol import (
-    BLUR,
-    JACOBIAN_MARGIN,
-    MIN_ALPHA,
-    NEAR_PLANE,
-    PLANE_SOFTENING,
-    Raster,
-    Splats,
-)
+from tcgsplat.render.conventions import BLUR, JACOBIAN_MARGIN, MIN_ALPHA, NEAR_PLANE, PLANE_SOFTENING
+from tcgsplat.render.protocol import Raster, Splats
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag, Pose
 
 

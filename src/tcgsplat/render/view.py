@@ -16,7 +16,8 @@ from torch import Tensor
 
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.render.protocol import MAX_OPACITY, Rasterizer, Splats
+from tcgsplat.render.conventions import MAX_OPACITY
+from tcgsplat.render.protocol import Rasterizer, Splats
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Image, PerGaussian, PerGaussianFlag, Plane, Pose

@@ -12,10 +12,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tcgsplat.geometry import quaternion
+from tcgsplat.scene.harmonics import SH_C0
 from tcgsplat.tensors import Ids, PerGaussian, PerGaussianFlag
 
-SH_C0 = 0.28209479177387814
-"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
 MAX_SH_DEGREE = 3
 
 

@@ -16,11 +16,13 @@ import torch
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.numba_cpu.simd import LANES
 from tcgsplat.render.view import Rendering
 from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.frame import Frame
-from tcgsplat.tensors import Image, Plane, Pose
+from tcgsplat.tensors import Plane, Pose
 from tcgsplat.tracking import alignment_kernels as kernels
+from tcgsplat.tracking.pyramids import NOTHING, halved, halved_depth, live_image, live_view, luma, rendered_view
 
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
@@ -114,9 +116,23 @@ class Alignment:
     """What depth alone asks for there."""
 
 
-def luma(color: Image) -> Floats:
-    """Intensity of an RGB image [h, w], on the CPU."""
-    return kernels.luma(color.numpy())  # type: ignore[no-any-return]
+def reference_points(
+    intensity: Floats, depth: Floats, weight: Floats, intrinsics: Floats, radius: int, stride: int
+) -> Floats:
+    """Points of a view [POINT, n]; images are [h, w] and contiguous; see the kernel of this name."""
+    h, w = depth.shape
+    n = LANES * len(range(2, h - 2, stride)) * len(range(2, w - 2, stride * LANES))
+    points: Floats = np.empty((kernels.POINT, n), np.float32)
+    images = (image.reshape(-1) for image in (intensity, depth, weight))
+    kernels.reference_points(*images, h, w, intrinsics, radius, stride, n, points.reshape(-1))
+    return points
+
+
+def normal_equations(points: Floats, live: Floats, constants: Floats) -> Doubles:
+    """The sums of one pass over points [POINT, n] and a live image [h, w, CHANNELS]; see the kernel of this name."""
+    sums, (h, w, _) = np.zeros(kernels.SUMS), live.shape
+    kernels.normal_equations(points.reshape(-1), points.shape[1], live.reshape(-1), h, w, constants, sums)
+    return sums
 
 
 @dataclass(frozen=True)
@@ -147,30 +163,27 @@ def _levels(frame: Frame, rendering: Rendering, weight: Plane, config: Alignment
     shows, which optimisation closes in time: dividing makes them too bright, not dividing leaves them too dark. So
     exposure is told by colours that are not divided, where the map is all but opaque.
     """
-    alpha = rendering.alpha.numpy()
-    intensity, depth = kernels.rendered_view(
-        rendering.color.numpy(), rendering.composited_plane_depth.numpy(), alpha, np.float32(config.min_alpha)
-    )
-    composited, solid = luma(rendering.color), np.where(alpha > SOLID, depth, np.float32(-1))
+    intensity, depth = rendered_view(rendering, config.min_alpha)
+    composited, solid = luma(rendering.color), np.where(rendering.alpha.numpy() > SOLID, depth, NOTHING)
     solid_points: Floats = np.empty((0, 0), np.float32)
     weights = np.ascontiguousarray(weight.numpy())
-    live, live_depth = kernels.live_view(frame.color.numpy(), frame.depth.numpy(), frame.valid.numpy())
+    live, live_depth = live_view(frame)
     camera, levels = frame.camera, list[_Level]()
     for number, passes in enumerate(passes_of_levels(config, camera)):
         if number:
-            intensity, weights, live = (kernels.halved_intensity(image) for image in (intensity, weights, live))
-            depth, live_depth = kernels.halved_depth(depth), kernels.halved_depth(live_depth)
+            intensity, weights, live = (halved(image) for image in (intensity, weights, live))
+            depth, live_depth = halved_depth(depth), halved_depth(live_depth)
             if not levels:
-                composited, solid = kernels.halved_intensity(composited), kernels.halved_depth(solid)
+                composited, solid = halved(composited), halved_depth(solid)
             camera = camera.scaled(0.5)
         if passes:
             intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
             sampling = (2, config.stride) if camera.width > SPARSE else (1, 1)
             gate = 2 * config.gate if number else config.gate
-            points = kernels.reference_points(intensity, depth, weights, intrinsics, *sampling)
+            points = reference_points(intensity, depth, weights, intrinsics, *sampling)
             if not levels:
-                solid_points = kernels.reference_points(composited, solid, weights, intrinsics, *sampling)
-            levels.append(_Level(passes, points, kernels.live_image(live, live_depth), intrinsics, gate))
+                solid_points = reference_points(composited, solid, weights, intrinsics, *sampling)
+            levels.append(_Level(passes, points, live_image(live, live_depth), intrinsics, gate))
     return levels, solid_points
 
 
@@ -224,8 +237,7 @@ def _constants(level: _Level, T: Doubles, photometry: Photometry, config: Alignm
 
 def _sums(level: _Level, T: Doubles, photometry: Photometry, config: AlignmentConfig) -> Doubles:
     """Of a pass over a level."""
-    sums: Doubles = kernels.normal_equations(level.points, level.live, _constants(level, T, photometry, config))
-    return sums
+    return normal_equations(level.points, level.live, _constants(level, T, photometry, config))
 
 
 def _equations(sums: Doubles) -> Equations:

@@ -5,23 +5,38 @@ without a reading by 0.
 """
 
 import numpy as np
-from numba import njit
+from numba import carray
 
-from tcgsplat.render.numba_cpu.compilation import kept
-from tcgsplat.render.numba_cpu.simd import (
-    LANES,
-    MATH,
-    floor,
+from tcgsplat.render.numba_cpu.compilation import kernel
+from tcgsplat.render.numba_cpu.lanes import (
+    add_rows,
+    even_and_odd,
     gather,
     gather_squares,
     load,
+    load_first,
+    load_rows,
+    load_spread,
     mask_ge,
+    side_by_side,
+    stack_floats,
+    store,
+    store_first,
+    store_rows,
+    sum_lanes,
+)
+from tcgsplat.render.numba_cpu.simd import (
+    LANES,
+    Vector,
+    Vectors,
+    apart,
+    floor,
+    formula,
     maximum,
     minimum,
+    ramp,
     spread,
     sqrt,
-    store,
-    sum_lanes,
     where_ge,
 )
 
@@ -62,195 +77,237 @@ FACING = np.float32(0.2)
 """Cosine between normal and viewing ray (scaled to z = 1) below which a surface is too slanted to measure depth on."""
 _CHUNK = 64
 """Vectors of points that are summed in float32 before the sums go to float64."""
-_ZERO, _QUARTER, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.25), np.float32(0.5), np.float32(1), np.float32(2)
+_ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 TINY = np.float32(1e-9)
 """Metres; anything above it is a reading."""
 THIN = np.float32(1e-3)
 """Coverage that is not divided by any more."""
+_FARTHEST = np.float32(1e9)
 BASE = np.float32(0.4)
 """Distance of the least depth noise, metres."""
-_RED, _GREEN, _BLUE = np.float32(0.299), np.float32(0.587), np.float32(0.114)
 
 
-@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True))
-def luma(color):
-    """Intensity [h, w] of an RGB image [h, w, 3]."""
-    h, w = color.shape[:2]
-    intensity = np.empty((h, w), np.float32)
-    for y in range(h):
-        for x in range(w):
-            intensity[y, x] = _RED * color[y, x, 0] + _GREEN * color[y, x, 1] + _BLUE * color[y, x, 2]
-    return intensity
+@formula
+def _merged(d00: Vector, d10: Vector, d01: Vector, d11: Vector) -> Vector:
+    """One depth of four; see `halved_depth`."""
+    readings, zero, one = (d00, d10, d01, d11), d00.of(_ZERO), d00.of(_ONE)
+    far = d00.of(_FARTHEST)
+    nearest, lowest = far, zero
+    for d in readings:
+        nearest, lowest = minimum(nearest, where_ge(zero, d, far, d)), minimum(lowest, d)
+    reach, total, count = nearest * (_ONE + SMOOTH), zero, zero
+    for d in readings:
+        agrees = where_ge(zero, d, zero, where_ge(d, reach, zero, one))
+        total, count = total + d * agrees, count + agrees
+    return where_ge(lowest, zero, total / maximum(count, one), -one)
 
 
-@kept(njit(error_model="numpy", nogil=True, cache=True))
-def live_view(color, depth, valid):
-    """Intensity and marked depth of a frame: what is not valid saw nothing."""
-    h, w = depth.shape
-    intensity, marked = luma(color), np.empty((h, w), np.float32)
-    for y in range(h):
-        for x in range(w):
-            marked[y, x] = depth[y, x] if valid[y, x] else -_ONE
-    return intensity, marked
+@kernel("f4[::1], i8, i8, f4[::1]")
+def halved_depth(depth, height, width, out):
+    """Mean of the readings of two by two pixels that agree with the nearest one; -1 if any saw nothing.
 
-
-@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True))
-def rendered_view(color, depth, alpha, min_alpha):
-    """Intensity and marked depth of images that are multiplied by alpha: what is hardly covered saw nothing.
-
-    So its black does not bleed into the coarse levels' points.
+    Images are flat: `depth` is [height, width], `out` half of that.
     """
-    h, w = depth.shape
-    intensity, marked = luma(color), np.empty((h, w), np.float32)
-    for y in range(h):
-        for x in range(w):
-            inverse = _ONE / max(alpha[y, x], THIN)
-            intensity[y, x] *= inverse
-            marked[y, x] = depth[y, x] * inverse if alpha[y, x] > min_alpha else -_ONE
-    return intensity, marked
+    half_width = width // 2
+    for y in range(height // 2):
+        for x in range(0, half_width, LANES):
+            at = 2 * (y * width + x)
+            count = 2 * (half_width - x)
+            d00, d10 = even_and_odd(load_first(depth, at, count), load_first(depth, at + LANES, count - LANES))
+            at += width
+            d01, d11 = even_and_odd(load_first(depth, at, count), load_first(depth, at + LANES, count - LANES))
+            store_first(out, y * half_width + x, _merged(d00, d10, d01, d11), half_width - x)
 
 
-@kept(njit(error_model="numpy", nogil=True, cache=True))
-def halved_intensity(image):
-    """Mean over two by two pixels."""
-    h, w = image.shape[0] // 2, image.shape[1] // 2
-    out = np.empty((h, w), np.float32)
-    for y in range(h):
-        for x in range(w):
-            out[y, x] = _QUARTER * (
-                image[2 * y, 2 * x] + image[2 * y, 2 * x + 1] + image[2 * y + 1, 2 * x] + image[2 * y + 1, 2 * x + 1]
-            )
-    return out
+@formula
+def _slopes(left: Vector, right: Vector, above: Vector, below: Vector) -> Vectors:
+    return (right - left) * _HALF, (below - above) * _HALF
 
 
-@kept(njit(error_model="numpy", nogil=True, cache=True))
-def halved_depth(depth):
-    """Mean of the readings of two by two pixels that agree with the nearest one; -1 if any saw nothing."""
-    h, w = depth.shape[0] // 2, depth.shape[1] // 2
-    out = np.zeros((h, w), np.float32)
-    for y in range(h):
-        for x in range(w):
-            nearest, lowest = np.float32(1e9), np.float32(0)
-            for k in range(4):
-                d = depth[2 * y + k // 2, 2 * x + k % 2]
-                lowest = min(lowest, d)
-                if d > 0:
-                    nearest = min(nearest, d)
-            if lowest < 0:
-                out[y, x] = -1
-            elif nearest < np.float32(1e9):
-                total, count = np.float32(0), np.float32(0)
-                for k in range(4):
-                    d = depth[2 * y + k // 2, 2 * x + k % 2]
-                    if 0 < d < nearest * (_ONE + SMOOTH):
-                        total += d
-                        count += _ONE
-                out[y, x] = total / count
-    return out
+@kernel("f4[::1], f4[::1], i8, i8, f4[::1]")
+def live_image(intensity, depth, height, width, out):
+    """What a pass samples, [height, width, CHANNELS]; slopes are central differences. The border stays empty.
+
+    Images are flat.
+    """
+    for y in range(1, height - 1):
+        for x in range(1, width - 1, LANES):
+            first = y * width + x
+            count = width - 1 - x
+            du, dv = _slopes(
+                load_first(intensity, first - 1, count), load_first(intensity, first + 1, count),
+                load_first(intensity, first - width, count), load_first(intensity, first + width, count),
+            )  # fmt: skip
+            pixels = side_by_side(load_first(intensity, first, count), du, dv, load_first(depth, first, count))
+            for k in range(CHANNELS):
+                store_first(out, CHANNELS * first + LANES * k, pixels[k], CHANNELS * count - LANES * k)
 
 
-@kept(njit(error_model="numpy", nogil=True, cache=True))
-def live_image(intensity, depth):
-    """What a pass samples, [h, w, CHANNELS]; slopes are central differences. The border stays empty: no pass asks."""
-    h, w = intensity.shape
-    out = np.empty((h, w, CHANNELS), np.float32)
-    for y in range(1, h - 1):
-        for x in range(1, w - 1):
-            out[y, x, 0] = intensity[y, x]
-            out[y, x, 1] = _HALF * (intensity[y, x + 1] - intensity[y, x - 1])
-            out[y, x, 2] = _HALF * (intensity[y + 1, x] - intensity[y - 1, x])
-            out[y, x, 3] = depth[y, x]
-    return out
+@formula
+def _surface(
+    intrinsics: Vectors, x: Vector, b: Vector, last: Vector, center: Vector, neighbours: Vectors, bounds: Vectors
+) -> tuple[Vectors, Vectors]:
+    """Points of sixteen pixels, 0 where there is none, and their normals, 0 where unknown; see `reference_points`.
+
+    `neighbours` are the readings on the left, right, above and below, and `bounds` are what `reference_points` makes
+    of their distance: how much a reading and a bend may differ, and one over the pixels between neighbours.
+    """
+    focal_x, focal_y, center_x, _ = intrinsics
+    left, right, up, down = neighbours
+    a = (minimum(x, last) - center_x) / focal_x
+    zero, one = x.of(_ZERO), x.of(_ONE)
+    d = where_ge(center, x.of(TINY), where_ge(last, x, center, zero), zero)
+    jump, bend, per_pixel = bounds
+    dz_du, dz_dv = (right - left) * per_pixel, (down - up) * per_pixel
+    # Tangents of the back-projected surface along u and v; their product points at the camera.
+    ux, uy, uz = d / focal_x + a * dz_du, b * dz_du, dz_du
+    vx, vy, vz = a * dz_dv, d / focal_y + b * dz_dv, dz_dv
+    nx, ny, nz = uz * vy - uy * vz, ux * vz - uz * vx, uy * vx - ux * vy
+    # A neighbour without a reading, 0 or less, is a jump.
+    jumps = maximum(maximum(apart(left, d), apart(right, d)), maximum(apart(up, d), apart(down, d)))
+    bends = maximum(apart(left + right, d * _TWO), apart(up + down, d * _TWO))
+    straight = where_ge(jumps, d * jump, zero, where_ge(bends, d * bend, zero, one))
+    length = sqrt(where_ge(straight, one, nx * nx + ny * ny + nz * nz, one))
+    inverse = straight / length
+    return (a * d, b * d, d), (nx * inverse, ny * inverse, nz * inverse)
 
 
-@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always"))
-def _apart(a, b):
-    return maximum(a - b, b - a)
-
-
-@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True))
-def reference_points(intensity, depth, weight, intrinsics, radius, stride):
-    """Points of a rendered view [POINT, n] in its camera frame, every `stride` pixels; normals from depth differences.
+@kernel("f4[::1], f4[::1], f4[::1], i8, i8, f4[::1], i8, i8, i8, f4[::1]")
+def reference_points(intensity, depth, weight, h, w, intrinsics, radius, stride, n, points):
+    """Points [POINT, n] of a rendered view in its camera frame, every `stride` pixels; normals from depth differences.
 
     A normal is kept where both axes are straight: neighbours at `radius` within 4 % of the depth per pixel, and their
     mean within 0.75 %; else it is zero, and the point counts for colour only. Every row of pixels is padded to whole
-    vectors. The intrinsics are fx, fy, cx, cy in pixels.
+    vectors, see `points_in`. The intrinsics are fx, fy, cx, cy in pixels. Images are flat.
     """
-    h, w = depth.shape
-    vectors = (len(range(2, w - 2, stride)) + LANES - 1) // LANES
-    n = len(range(2, h - 2, stride)) * vectors * LANES
-    points = np.empty((POINT, n), np.float32)
-    columns = np.empty(LANES, np.float32)
-    for k in range(LANES):
-        columns[k] = 2 + stride * k
-    zero, one, last = spread(_ZERO), spread(_ONE), spread(np.float32(w - 3))
-    focal_x, focal_y, center_x, center_y = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    jump, bend = np.float32(0.04 * radius), np.float32(0.015 * radius)
-    per_pixel = np.float32(0.5 / radius)
+    last = np.float32(w - 3)
+    bounds = np.float32(0.04 * radius), np.float32(0.015 * radius), np.float32(0.5 / radius)
+    # Not in the loops, where the compiler could not know that what is stored does not change them.
+    focal_y, center_y, numbers = intrinsics[1], intrinsics[3], load_spread(intrinsics, 0, 4)
     i = 0
     for y in range(2, h - 2, stride):
         row = y * w
-        b = spread((np.float32(y) - center_y) / focal_y)
-        for k in range(vectors):
-            x = load(columns, 0) + np.float32(k * LANES * stride)
+        b = (np.float32(y) - center_y) / focal_y
+        for left in range(2, w - 2, stride * LANES):
+            x = ramp(left, stride)
             at = minimum(x, last)
-            d = gather(depth, row, at)
-            d = where_ge(d, spread(TINY), where_ge(last, x, d, zero), zero)
-            left, right = gather(depth, row - radius, at), gather(depth, row + radius, at)
-            up, down = gather(depth, row - radius * w, at), gather(depth, row + radius * w, at)
-            a = (at - center_x) / focal_x
-            dz_du, dz_dv = (right - left) * per_pixel, (down - up) * per_pixel
-            # Tangents of the back-projected surface along u and v; their product points at the camera.
-            ux, uy, uz = d / focal_x + a * dz_du, b * dz_du, dz_du
-            vx, vy, vz = a * dz_dv, d / focal_y + b * dz_dv, dz_dv
-            nx, ny, nz = uz * vy - uy * vz, ux * vz - uz * vx, uy * vx - ux * vy
-            # A neighbour without a reading, 0 or less, is a jump.
-            jumps = maximum(maximum(_apart(left, d), _apart(right, d)), maximum(_apart(up, d), _apart(down, d)))
-            bends = maximum(_apart(left + right, d * _TWO), _apart(up + down, d * _TWO))
-            straight = where_ge(jumps, d * jump, zero, where_ge(bends, d * bend, zero, one))
-            length = sqrt(where_ge(straight, one, nx * nx + ny * ny + nz * nz, one))
-            inverse = straight / length
-            store(points, PX * n + i, a * d)
-            store(points, PY * n + i, b * d)
-            store(points, PZ * n + i, d)
-            store(points, NX * n + i, nx * inverse)
-            store(points, NY * n + i, ny * inverse)
-            store(points, NZ * n + i, nz * inverse)
+            neighbours = (
+                gather(depth, row - radius, at), gather(depth, row + radius, at),
+                gather(depth, row - radius * w, at), gather(depth, row + radius * w, at),
+            )  # fmt: skip
+            point, normal = _surface(numbers, x, b, last, gather(depth, row, at), neighbours, bounds)
+            store_rows(points, PX * n + i, n, point)
+            store_rows(points, NX * n + i, n, normal)
             store(points, REFERENCE * n + i, gather(intensity, row, at))
             store(points, WEIGHT * n + i, gather(weight, row, at))
             i += LANES
     return points
 
 
-@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always"))
-def _mixed(squares, channel, w00, w10, w01, w11):
-    """One channel of four pixels, interpolated."""
-    return (
-        w00 * squares[channel] + w10 * squares[CHANNELS + channel]
-        + w01 * squares[2 * CHANNELS + channel] + w11 * squares[3 * CHANNELS + channel]
+@formula
+def _rotated(constants: Vectors, a: Vectors) -> Vectors:
+    """A vector of the reference camera in the live one's axes."""
+    rows = (constants[ROTATION + 3 * k : ROTATION + 3 * k + 3] for k in range(3))
+    return tuple(a[0] * r0 + a[1] * r1 + a[2] * r2 for r0, r1, r2 in rows)
+
+
+@formula
+def _moved(constants: Vectors, point: Vectors) -> Vectors:
+    """A point of the reference camera in the live one: Y = R X + t, and 1 / Y_z, never above 1 / NEAREST."""
+    translation = constants[TRANSLATION : TRANSLATION + 3]
+    X, Y, Z = (turned + t for turned, t in zip(_rotated(constants, point), translation, strict=True))
+    return X, Y, Z, _ONE / maximum(Z, Z.of(NEAREST))
+
+
+@formula
+def _pixel(constants: Vectors, point: Vectors, moved: Vectors, end_u: Vector, end_v: Vector) -> Vectors:
+    """Where a point is seen, (u, v), and whether it is in view, 0 or 1."""
+    focal_x, focal_y, center_x, center_y = constants[INTRINSICS : INTRINSICS + 4]
+    (_, _, pz), (X, Y, Z, iz) = point, moved
+    zero, one = X.of(_ZERO), X.of(_ONE)
+    u, v = X * iz * focal_x + center_x, Y * iz * focal_y + center_y
+    in_front = where_ge(pz, X.of(TINY), where_ge(Z, X.of(NEAREST), one, zero), zero)
+    in_columns = where_ge(u, end_u, zero, where_ge(u, one, in_front, zero))
+    in_view = where_ge(v, end_v, zero, where_ge(v, one, in_columns, zero))
+    half = X.of(_HALF)
+    return where_ge(in_view, half, u, one), where_ge(in_view, half, v, one), in_view
+
+
+def _added_by(weight: Vector, r: Vector, j: Vectors) -> Vectors:
+    """What one weighted residual adds to H (upper triangle) and to g."""
+    weighted = [weight * slope for slope in j]
+    return (*(weighted[a] * j[b] for a in range(6) for b in range(a, 6)), *(wj * r for wj in weighted))
+
+
+@formula
+def _added(
+    constants: Vectors, precisions: Vectors, moved: Vectors, between: Vectors, squares: Vectors, normal: Vectors,
+    reference: Vector, weight: Vector, in_view: Vector,
+) -> tuple[Vectors, Vectors, Vectors]:  # fmt: skip
+    """What sixteen points add to the sums of `normal_equations`: by depth, by colour, and to the statistics.
+
+    `between` is where a point is between the four pixels that `squares` has the channels of.
+    """
+    (X, Y, Z, iz), (a, b), (color_precision, depth_precision) = moved, between, precisions
+    focal_x, focal_y = constants[INTRINSICS], constants[INTRINSICS + 1]
+    zero, one, half = X.of(_ZERO), X.of(_ONE), X.of(_HALF)
+    w11 = a * b
+    w10, w01 = a - w11, b - w11
+    w00 = _ONE - a - w01
+
+    def mixed(channel: int) -> Vector:
+        c00, c10, c01, c11 = squares[channel::CHANNELS]
+        return w00 * c00 + w10 * c10 + w01 * c01 + w11 * c11
+
+    def slopes(jx: Vector, jy: Vector, jz: Vector) -> Vectors:
+        return jx, jy, jz, Y * jz - Z * jy, Z * jx - X * jz, X * jy - Y * jx
+
+    # Depth: bilinear where the four pixels lie on one surface, else the nearest one's.
+    d00, d10, d01, d11 = squares[3::CHANNELS]
+    low, high = minimum(minimum(d00, d10), minimum(d01, d11)), maximum(maximum(d00, d10), maximum(d01, d11))
+    nearest = where_ge(b, half, where_ge(a, half, d11, d01), where_ge(a, half, d10, d00))
+    d = where_ge(high - low, low * SMOOTH, nearest, mixed(3))
+    in_view = where_ge(d, zero, in_view, zero)
+    reading = where_ge(d, d.of(TINY), in_view, zero)
+    agreeing = where_ge((d * _HALF + _ONE) * constants[GATE], apart(d, Z), reading, zero)
+    behind = where_ge(agreeing, half, d - Z, zero)
+
+    # Geometry. dr/drho = -n, dr/domega = -(Y x n); residual and slope are divided by n . ray.
+    nx, ny, nz = _rotated(constants, normal)
+    facing = (nx * X + ny * Y + nz * Z) * iz
+    faces = where_ge(maximum(facing, zero - facing), d.of(FACING), one, zero)
+    scale = where_ge(faces, half, _ONE / facing, zero)
+    past = d - BASE
+    sigma = past * past * constants[SIGMA_SLOPE] + constants[SIGMA_FLOOR]
+    precision = _ONE / (sigma * sigma)
+    depth_square = behind * behind * precision
+    depth_counts = weight * agreeing * faces
+    student = (STUDENT_DOF + _ONE) / (depth_square * depth_precision + STUDENT_DOF)
+    depth_weight = depth_counts * student
+    j = slopes(zero - nx * scale, zero - ny * scale, zero - nz * scale)
+    by_depth = _added_by(depth_weight * precision * (depth_precision * constants[BALANCE]), behind, j)
+
+    # Colour, where the depth does not disagree.
+    seen = mixed(0)
+    r = seen - (reference * constants[GAIN] + constants[OFFSET])
+    color_counts = weight * (in_view - reading + agreeing)
+    student = (STUDENT_DOF + _ONE) / (r * r * color_precision + STUDENT_DOF)
+    color_weight = color_counts * student
+    jx, jy = mixed(1) * iz * focal_x, mixed(2) * iz * focal_y
+    by_color = _added_by(color_weight * color_precision, r, slopes(jx, jy, zero - (jx * X + jy * Y) * iz))
+
+    by_reference, by_seen = color_weight * reference, color_weight * seen
+    statistics = (
+        color_weight * r * r, color_counts, depth_weight * depth_square, depth_counts,
+        color_weight, by_reference, by_seen, by_reference * reference, by_reference * seen, by_seen * seen,
+        in_view, reading, agreeing,
     )  # fmt: skip
+    return by_depth, by_color, statistics
 
 
-@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always"))
-def _add(sums, entry, value):
-    store(sums, entry * LANES, load(sums, entry * LANES) + value)
-
-
-@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True, inline="always"))
-def _add_residual(sums, weight, r, j):
-    """One weighted residual of every lane into the normal equations."""
-    entry = HESSIAN
-    for a in range(6):
-        wj = weight * j[a]
-        _add(sums, GRADIENT + a, wj * r)
-        for b in range(a, 6):
-            _add(sums, entry, wj * j[b])
-            entry += 1
-
-
-@kept(njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True))
-def normal_equations(points, live, constants):
-    """One Gauss-Newton pass over the reference points: the SUMS, float64.
+@kernel("f4[::1], i8, f4[::1], i8, i8, f4[::1], f8[::1]")
+def normal_equations(points, n, live, h, w, constants, totals):
+    """One Gauss-Newton pass over the reference points: adds to the SUMS, float64.
 
     A point X of the reference camera goes to Y = R X + t in the live camera; the pose is perturbed on the left,
     Y + rho + omega x Y. Residuals:
@@ -261,103 +318,31 @@ def normal_equations(points, live, constants):
 
     What does not count has weight 0, looks at pixel (1, 1) if it is out of view, and never multiplies 0 by infinity.
     """
-    h, w = live.shape[:2]
-    n, pitch = points.shape[1], CHANNELS * w
-    R, t = ROTATION, TRANSLATION
-    r00, r01, r02, t0 = constants[R], constants[R + 1], constants[R + 2], constants[t]
-    r10, r11, r12, t1 = constants[R + 3], constants[R + 4], constants[R + 5], constants[t + 1]
-    r20, r21, r22, t2 = constants[R + 6], constants[R + 7], constants[R + 8], constants[t + 2]
-    focal_x, focal_y = constants[INTRINSICS], constants[INTRINSICS + 1]
-    center_x, center_y = constants[INTRINSICS + 2], constants[INTRINSICS + 3]
-    gain, offset, gate = constants[GAIN], constants[OFFSET], constants[GATE]
-    sigma_floor, sigma_slope = constants[SIGMA_FLOOR], constants[SIGMA_SLOPE]
-    color_precision = _ONE / (constants[COLOR_SCALE] * constants[COLOR_SCALE])
-    depth_precision = _ONE / (constants[DEPTH_SCALE] * constants[DEPTH_SCALE])
-    balance = constants[BALANCE]
-    zero, one, half, tiny, near = spread(_ZERO), spread(_ONE), spread(_HALF), spread(TINY), spread(NEAREST)
-    end_u, end_v = spread(np.float32(w - 2)), spread(np.float32(h - 2))
-    totals, sums = np.zeros(SUMS), np.empty(SUMS * LANES, np.float32)
+    precisions = (
+        _ONE / (constants[COLOR_SCALE] * constants[COLOR_SCALE]),
+        _ONE / (constants[DEPTH_SCALE] * constants[DEPTH_SCALE]),
+    )
+    end_u, end_v = np.float32(w - 2), np.float32(h - 2)
+    numbers = load_spread(constants, 0, CONSTANTS)
+    sums = carray(stack_floats(640), SUMS * LANES)
     for start in range(0, n, _CHUNK * LANES):
         for entry in range(SUMS):
-            store(sums, entry * LANES, zero)
-        stop = start + _CHUNK * LANES
-        for i in range(start, stop if stop < n else n, LANES):
-            px, py, pz = load(points, PX * n + i), load(points, PY * n + i), load(points, PZ * n + i)
-            X, Y, Z = (
-                px * r00 + py * r01 + pz * r02 + t0,
-                px * r10 + py * r11 + pz * r12 + t1,
-                px * r20 + py * r21 + pz * r22 + t2,
-            )
-            iz = _ONE / maximum(Z, near)
-            u, v = X * iz * focal_x + center_x, Y * iz * focal_y + center_y
-            in_front = where_ge(pz, tiny, where_ge(Z, near, one, zero), zero)
-            in_columns = where_ge(u, end_u, zero, where_ge(u, one, in_front, zero))
-            in_view = where_ge(v, end_v, zero, where_ge(v, one, in_columns, zero))
-            if mask_ge(in_view, half) == 0:
+            store(sums, entry * LANES, spread(_ZERO))
+        for i in range(start, min(start + _CHUNK * LANES, n), LANES):
+            point = load_rows(points, PX * n + i, n, 3)
+            moved = _moved(numbers, point)
+            u, v, in_view = _pixel(numbers, point, moved, end_u, end_v)
+            if mask_ge(in_view, spread(_HALF)) == 0:
                 continue
-            u, v = where_ge(in_view, half, u, one), where_ge(in_view, half, v, one)
             x0, y0 = floor(u), floor(v)
-            squares = gather_squares(live, pitch, x0, y0)
-            a, b = u - x0, v - y0
-            w11 = a * b
-            w10, w01 = a - w11, b - w11
-            w00 = _ONE - a - w01
-
-            # Depth: bilinear where the four pixels lie on one surface, else the nearest one's.
-            d00, d10, d01, d11 = squares[3], squares[7], squares[11], squares[15]
-            low, high = minimum(minimum(d00, d10), minimum(d01, d11)), maximum(maximum(d00, d10), maximum(d01, d11))
-            nearest = where_ge(b, half, where_ge(a, half, d11, d01), where_ge(a, half, d10, d00))
-            d = where_ge(high - low, low * SMOOTH, nearest, _mixed(squares, 3, w00, w10, w01, w11))
-            in_view = where_ge(d, zero, in_view, zero)
-            reading = where_ge(d, tiny, in_view, zero)
-            agreeing = where_ge((d * _HALF + _ONE) * gate, _apart(d, Z), reading, zero)
-            behind = where_ge(agreeing, half, d - Z, zero)
-            weight = load(points, WEIGHT * n + i)
-
-            # Geometry. dr/drho = -n, dr/domega = -(Y x n); residual and slope are divided by n . ray.
-            n0, n1, n2 = load(points, NX * n + i), load(points, NY * n + i), load(points, NZ * n + i)
-            nx, ny, nz = (
-                n0 * r00 + n1 * r01 + n2 * r02,
-                n0 * r10 + n1 * r11 + n2 * r12,
-                n0 * r20 + n1 * r21 + n2 * r22,
-            )
-            facing = (nx * X + ny * Y + nz * Z) * iz
-            faces = where_ge(maximum(facing, zero - facing), spread(FACING), one, zero)
-            scale = where_ge(faces, half, _ONE / facing, zero)
-            past = d - BASE
-            sigma = past * past * sigma_slope + sigma_floor
-            precision = _ONE / (sigma * sigma)
-            depth_square = behind * behind * precision
-            depth_counts = weight * agreeing * faces
-            student = (STUDENT_DOF + _ONE) / (depth_square * depth_precision + STUDENT_DOF)
-            depth_weight = depth_counts * student
-            jx, jy, jz = zero - nx * scale, zero - ny * scale, zero - nz * scale
-            j = (jx, jy, jz, Y * jz - Z * jy, Z * jx - X * jz, X * jy - Y * jx)
-            _add_residual(sums, depth_weight * precision * (depth_precision * balance), behind, j)
-
-            # Colour, where the depth does not disagree.
-            reference = load(points, REFERENCE * n + i)
-            seen = _mixed(squares, 0, w00, w10, w01, w11)
-            r = seen - (reference * gain + offset)
-            color_counts = weight * (in_view - reading + agreeing)
-            student = (STUDENT_DOF + _ONE) / (r * r * color_precision + STUDENT_DOF)
-            color_weight = color_counts * student
-            jx, jy = (
-                _mixed(squares, 1, w00, w10, w01, w11) * iz * focal_x,
-                _mixed(squares, 2, w00, w10, w01, w11) * iz * focal_y,
-            )
-            jz = zero - (jx * X + jy * Y) * iz
-            j = (jx, jy, jz, Y * jz - Z * jy, Z * jx - X * jz, X * jy - Y * jx)
-            _add_residual(sums, color_weight * color_precision, r, j)
-
-            by_reference, by_seen = color_weight * reference, color_weight * seen
-            statistics = (
-                color_weight * r * r, color_counts, depth_weight * depth_square, depth_counts,
-                color_weight, by_reference, by_seen, by_reference * reference, by_reference * seen, by_seen * seen,
-                in_view, reading, agreeing,
+            by_depth, by_color, statistics = _added(
+                numbers, precisions, moved, (u - x0, v - y0), gather_squares(live, CHANNELS * w, x0, y0),
+                load_rows(points, NX * n + i, n, 3), load(points, REFERENCE * n + i), load(points, WEIGHT * n + i),
+                in_view,
             )  # fmt: skip
-            for k in range(STATISTICS):
-                _add(sums, FIRST_STATISTIC + k, statistics[k])
+            add_rows(sums, HESSIAN * LANES, LANES, by_depth)
+            add_rows(sums, HESSIAN * LANES, LANES, by_color)
+            add_rows(sums, FIRST_STATISTIC * LANES, LANES, statistics)
         for entry in range(SUMS):
             totals[entry] += sum_lanes(load(sums, entry * LANES))
     return totals

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from tcgsplat.render.numba_cpu.simd import LANES
 from tcgsplat.scene.frame import Frame
 from tcgsplat.tracking import smoothing_kernels as kernels
 
@@ -19,5 +20,7 @@ def smoothed(frame: Frame) -> Frame:
     Returns:
         A frame with the same readings and holes. No reading is a mean over two surfaces.
     """
-    depth = kernels.smoothed(np.ascontiguousarray(frame.depth.cpu().numpy()))
-    return replace(frame, depth=torch.from_numpy(depth).to(frame.depth.device))
+    depth = frame.depth.cpu().numpy()
+    out = depth.copy()
+    kernels.smoothed(np.pad(depth.ravel(), (0, LANES)), *depth.shape, out.reshape(-1))
+    return replace(frame, depth=torch.from_numpy(out).to(frame.depth.device))

@@ -6,6 +6,7 @@ from typing import Final
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,6 +17,10 @@ from tcgsplat.scene.frame import Frame
 from tcgsplat.tensors import Pose
 from tcgsplat.tracking import synchronization_kernels as kernels
 
+Floats = npt.NDArray[np.float32]
+
+NEAREST: Final = np.float32(0.01)
+"""Metres: what claims to be nearer than this is no reading, and its inverse would overflow."""
 MIN_SHIFT: Final = 0.1
 """Pixels below which nothing is moved: less than the sensor's own registration of depth to colour is good for."""
 MAX_STEP: Final = 0.3
@@ -46,7 +51,7 @@ def synchronized(frame: Frame, velocity: Float[Tensor, "6"]) -> Frame:
     length, angle = float(step[:3].norm()), float(step[3:].norm())
     if not (length < MAX_STEP and angle < MAX_STEP):  # neither holds for NaN
         return frame
-    inverse_depth = kernels.inverse(np.ascontiguousarray(frame.depth.cpu().numpy()))
+    inverse_depth = _inverse(frame.depth.cpu().numpy())
     ray = _longest_ray(frame.camera)
     focal = max(frame.camera.fx, frame.camera.fy)
     # The ray r of a point at z moves by t / z + omega x r, less its part along r: by |t| |r| / z and |omega| |r|^2.
@@ -56,8 +61,18 @@ def synchronized(frame: Frame, velocity: Float[Tensor, "6"]) -> Frame:
     reach = min(math.ceil(parallax), MAX_REACH)
     nearest = cv2.dilate(inverse_depth, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
     H, e = _projection(frame.camera, se3.exp(-step))
-    depth = kernels.moved(inverse_depth, nearest, np.ascontiguousarray(frame.valid.cpu().numpy()), H, e)
+    height, width = inverse_depth.shape
+    depth: Floats = np.empty((height, width), np.float32)
+    behind = np.zeros(width + 2, np.float32)
+    flat = np.concatenate((inverse_depth.reshape(-1), behind))
+    kernels.moved(flat, nearest.reshape(-1), H.reshape(-1), e, height, width, depth.reshape(-1))
+    depth[~frame.valid.cpu().numpy()] = 0
     return replace(frame, depth=torch.from_numpy(depth).to(frame.depth.device), depth_timestamp=None)
+
+
+def _inverse(depth: Floats) -> Floats:
+    """1 / depth, 0 where there is no reading."""
+    return np.divide(np.float32(1), depth, out=np.zeros(depth.shape, np.float32), where=depth > NEAREST)
 
 
 def _longest_ray(camera: Camera) -> float:
@@ -67,7 +82,7 @@ def _longest_ray(camera: Camera) -> float:
     return math.hypot(x, y, 1.0)
 
 
-def _projection(camera: Camera, T_depth_color: Pose) -> tuple[kernels.Floats, kernels.Floats]:
+def _projection(camera: Camera, T_depth_color: Pose) -> tuple[Floats, Floats]:
     """K R K^-1 and K t: where a pixel of the colour instant is at the depth instant, at infinity and per 1/z."""
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     T = T_depth_color.numpy()

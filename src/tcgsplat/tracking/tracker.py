@@ -20,8 +20,9 @@ from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, Equations, align, correlation, luma
+from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, Equations, align, correlation
 from tcgsplat.tracking.descent import DescentConfig, descend
+from tcgsplat.tracking.pyramids import luma
 
 
 @dataclass(frozen=True)

@@ -211,7 +211,7 @@ def completed(
         EvaluationError: if fewer than three frames that could be read have a true pose.
         KeyboardInterrupt: at Ctrl-C, saying what is kept.
     """
-    compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
+    compile_kernels(config, rasterizer)
     wanted = [
         (one, arm, seed)  # seed by seed: whole tables as soon as possible
         for seed in seeds

@@ -112,7 +112,7 @@ def performed(folder: Path, config: SlamConfig, rasterizer: Rasterizer, every: i
     if truth is None:
         raise EvaluationError(f"{folder} has no folder `truth`: exact depth is needed; `tcgsplat synth` makes it")
     torch.set_num_threads(1)  # as in a run
-    compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
+    compile_kernels(config, rasterizer)
     store = InMemory()
     slam, observer = Slam(config, rasterizer, store=store), Observer(truth, config, rasterizer, every)
     sequence = Part().open(folder)

@@ -14,10 +14,12 @@ from tcgsplat.config import SlamConfig
 from tcgsplat.geometry import quaternion, se3
 from tcgsplat.mapping.optimization import begin
 from tcgsplat.render.backends import open_rasterizer
-from tcgsplat.render.protocol import BLUR, NEAR_PLANE, Rasterizer
+from tcgsplat.render.conventions import BLUR, NEAR_PLANE
+from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import render_view
 from tcgsplat.scene.frame import Frame
-from tcgsplat.scene.gaussians import SH_C0, Gaussians
+from tcgsplat.scene.gaussians import Gaussians
+from tcgsplat.scene.harmonics import SH_C0
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.tensors import Pose
 from tcgsplat.tracking.descent import DescentConfig, descend

@@ -10,7 +10,7 @@ from tcgsplat.mapping.native_optimization import filled, packed
 from tcgsplat.render.numba_cpu.layout import CHANNELS, FEATURE, PARAMETERS, Floats, to_blocks
 from tcgsplat.render.numba_cpu.passes import Drawn, Passes, Workspace
 from tcgsplat.render.protocol import Splats
-from tcgsplat.scene.gaussians import SH_C0
+from tcgsplat.scene.harmonics import SH_C0
 
 
 class Iteration:

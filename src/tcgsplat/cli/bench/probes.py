@@ -10,6 +10,9 @@ from collections.abc import Callable
 import numpy as np
 from numba import njit
 
+from tcgsplat.render.conventions import MIN_ALPHA, MIN_TRANSMITTANCE
+from tcgsplat.render.numba_cpu.compilation import FLAGS
+from tcgsplat.render.numba_cpu.lanes import load, store
 from tcgsplat.render.numba_cpu.layout import (
     BLOCK,
     FORM_A,
@@ -24,9 +27,8 @@ from tcgsplat.render.numba_cpu.layout import (
     V,
     aligned,
 )
-from tcgsplat.render.numba_cpu.simd import LANES, MATH, fma, load, spread, store
+from tcgsplat.render.numba_cpu.simd import LANES, fma, spread
 from tcgsplat.render.numba_cpu.workers import Workers
-from tcgsplat.render.protocol import MIN_ALPHA, MIN_TRANSMITTANCE
 
 _LOG2_MIN_ALPHA = np.float32(math.log2(MIN_ALPHA))
 _MIN_TRANSMITTANCE = np.float32(MIN_TRANSMITTANCE)
@@ -35,7 +37,7 @@ _ROUNDS = 20_000
 """Tens of microseconds a run: short enough to fall between two interruptions."""
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
+@njit(fastmath=set(FLAGS), error_model="numpy", nogil=True, cache=True)
 def _five_chains(rounds, numbers):
     """Five chains of vector multiply-adds that do not wait for each other: all that sixteen registers hold."""
     a, b = spread(numbers[0]), spread(numbers[1])
@@ -45,7 +47,7 @@ def _five_chains(rounds, numbers):
     store(numbers, 0, ((v0 + v1) + (v2 + v3)) + v4)
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
+@njit(fastmath=set(FLAGS), error_model="numpy", nogil=True, cache=True)
 def _ten_chains(rounds, numbers):
     """Ten of them: two pipes of a latency of four or five are full, where a vector is one register."""
     a, b = spread(numbers[0]), spread(numbers[1])
@@ -80,7 +82,7 @@ def clock_rate() -> float:
     return 8 * _ROUNDS / _shortest(lambda: _integer_chain(_ROUNDS, 0x12345, 0x54321))
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
+@njit(fastmath=set(FLAGS), error_model="numpy", nogil=True, cache=True)
 def _scaled(start, stop, source, target):
     for i in range(start, stop, 16):
         store(target, i, load(source, i) * np.float32(0.5))
@@ -107,7 +109,7 @@ def _shortest(work: Callable[[], object], runs: int = _RUNS) -> float:
     return min(seconds)
 
 
-@njit(fastmath=MATH, error_model="numpy", nogil=True, cache=True)
+@njit(fastmath=set(FLAGS), error_model="numpy", nogil=True, cache=True)
 def needed(tile_ends, pair_splats, records, masks, tiles_x, width, height):
     """Pixels, blocks and tiles that compositing cannot leave out: each splat counts with each one that it shows in.
 

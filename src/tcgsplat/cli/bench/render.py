@@ -14,9 +14,10 @@ from tcgsplat.cli.bench.iteration import Iteration
 from tcgsplat.cli.bench.limit import Machine, Needs, floors
 from tcgsplat.cli.summary import machine
 from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.conventions import MAX_OPACITY
 from tcgsplat.render.numba_cpu.passes import Drawn, Passes
 from tcgsplat.render.numba_cpu.workers import available_cores
-from tcgsplat.render.protocol import MAX_OPACITY, Splats
+from tcgsplat.render.protocol import Splats
 from tcgsplat.storage import atomic
 
 

@@ -12,7 +12,7 @@ import torch
 from tcgsplat import datasets
 from tcgsplat.cli.bench import Track
 from tcgsplat.cli.kernels import compile_kernels
-from tcgsplat.cli.progress import RunProgress, say
+from tcgsplat.cli.progress import RunProgress
 from tcgsplat.cli.recorder import Part
 from tcgsplat.cli.settings import resolved
 from tcgsplat.cli.summary import machine, versions
@@ -110,7 +110,7 @@ def command(args: Track, settings: Mapping[str, str]) -> int:
 
 def measured(sequence: datasets.Sequence, config: SlamConfig, rasterizer: Rasterizer) -> Timed:
     """SLAM through a whole sequence, once its kernels are compiled, timed frame by frame."""
-    compile_kernels(config, rasterizer, lambda: say("compiling kernels, once per machine: some twenty seconds"))
+    compile_kernels(config, rasterizer)
     return through(Slam(config, rasterizer), sequence)
 
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.render import protocol
+from tcgsplat.render import conventions
 from tcgsplat.render.cuda.launching import THREADS, Compiled, Kernels, source
 from tcgsplat.render.protocol import Raster, Splats
 from tcgsplat.tensors import Pose
@@ -26,7 +26,7 @@ _CONSTANTS = ("NEAR_PLANE", "MIN_ALPHA", "MIN_TRANSMITTANCE", "BLUR", "PLANE_SOF
 
 def kernel_text(features: int) -> str:
     """All kernels as C++, for so many feature channels."""
-    constants = {name: f"{getattr(protocol, name)!r}f" for name in _CONSTANTS}
+    constants = {name: f"{getattr(conventions, name)!r}f" for name in _CONSTANTS}
     constants |= {"LOG2_E": "1.4426950408889634f", "FEATURES": str(features), "SUMS": str(_sums(features))}
     return source(constants, *(f"render/cuda/{name}" for name in ("kernel.cuh", "projection.cu", "blending.cu")))
 

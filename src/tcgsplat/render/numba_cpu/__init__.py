@@ -1,5 +1,1 @@
 """The CPU backend: explicit 16-wide kernels in numba; see README.md in this folder for the design."""
-
-from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer
-
-__all__ = ["NumbaRasterizer"]

@@ -12,14 +12,34 @@ a stored transmittance: with d_i = f_i . dL/dout, dL/dalpha_i = T_i d_i - (sum_{
 import math
 
 import numpy as np
-from numba import carray, njit
+from numba import carray
 
-from tcgsplat.render.numba_cpu.compilation import kept
+from tcgsplat.render.conventions import MIN_ALPHA, MIN_TRANSMITTANCE
+from tcgsplat.render.numba_cpu.compilation import inner
+from tcgsplat.render.numba_cpu.lanes import (
+    append_where_bit,
+    lane_sums,
+    load,
+    load_first,
+    load_rows,
+    load_spread,
+    mask_ge,
+    prefetch,
+    prefetch_to_write,
+    regrouped,
+    stack_floats,
+    store,
+    store_first,
+    store_rows,
+    trailing_zeros,
+)
 from tcgsplat.render.numba_cpu.layout import (
+    BLOCK,
     BLOCK_X,
     BLOCK_Y,
     CHANNELS,
     DEPTH,
+    FEATURES,
     FORM_A,
     FORM_B,
     FORM_C,
@@ -39,60 +59,78 @@ from tcgsplat.render.numba_cpu.layout import (
     U,
     V,
 )
-from tcgsplat.render.numba_cpu.simd import (
-    INNER,
-    MATH,
-    append_where_bit,
-    exp2,
-    fma,
-    lane_sums,
-    load,
-    load_first,
-    load_rows,
-    mask_ge,
-    maximum,
-    minimum,
-    prefetch,
-    prefetch_to_write,
-    regrouped,
-    spread,
-    stack_floats,
-    store,
-    store_first,
-    store_rows,
-    trailing_zeros,
-    where_ge,
-)
-from tcgsplat.render.protocol import MIN_ALPHA, MIN_TRANSMITTANCE
+from tcgsplat.render.numba_cpu.simd import Vector, Vectors, exp2, fma, formula, maximum, minimum, spread, where_ge
 
 _LOG2_MIN_ALPHA = np.float32(math.log2(MIN_ALPHA))
 _MIN_TRANSMITTANCE = np.float32(MIN_TRANSMITTANCE)
+_BLOCK_SPAN = np.float32(BLOCK - 1)
 BACKWARD_FLOATS = 2 * TILE_PIXELS
 """Length of the `local` that `backward` needs."""
 _AHEAD = 24  # records asked for in advance: about the latency of memory over the time of one ellipse test
 
 
-@njit(fastmath=MATH, **INNER, inline="always")
-def _blocks_touched(records, at, origin_x, origin_y, grid):
-    """Mask of the blocks in which log2 alpha reaches its threshold at some point of the block's pixel rectangle.
+@formula
+def _highest(record: Vectors, from_x: Vector, from_y: Vector) -> Vector:
+    """Of each block log2 alpha at its highest point; `from_x`, `from_y`: from the splat's centre to its first pixel.
 
     The form is concave, so its maximum over a rectangle away from the centre lies on one of the two nearest edges;
     each edge's best point is where the ridge meets it, clamped to the edge.
     """
-    u, v = records[at + U] - origin_x, records[at + V] - origin_y
-    A, B, C = spread(records[at + FORM_A]), spread(records[at + FORM_B]), spread(records[at + FORM_C])
-    three, zero = np.float32(3), spread(np.float32(0))
-    x0, y0 = load(grid, BLOCK_X) - u, load(grid, BLOCK_Y) - v
-    x1, y1 = x0 + three, y0 + three
+    A, B, C = record[FORM_A : FORM_C + 1]
+    x0, y0, zero = from_x, from_y, from_x.of(0)
+    x1, y1 = x0 + _BLOCK_SPAN, y0 + _BLOCK_SPAN
     x_near, y_near = maximum(x0, minimum(zero, x1)), maximum(y0, minimum(zero, y1))
-    y_best = maximum(y0, minimum(x_near * records[at + RIDGE_Y], y1))
-    x_best = maximum(x0, minimum(y_near * records[at + RIDGE_X], x1))
+    y_best = maximum(y0, minimum(x_near * record[RIDGE_Y], y1))
+    x_best = maximum(x0, minimum(y_near * record[RIDGE_X], x1))
     on_column = fma(fma(A, x_near, B * y_best), x_near, C * y_best * y_best)
     on_row = fma(fma(A, x_best, B * y_near), x_best, C * y_near * y_near)
-    return mask_ge(maximum(on_column, on_row), spread(_LOG2_MIN_ALPHA - records[at + RECORD_LOG2_OPACITY]))
+    return maximum(on_column, on_row)
 
 
-@kept(njit(fastmath=MATH, **INNER))
+def _alpha(record: Vectors, dx: Vector, dy: Vector) -> Vector:
+    """Opacity at sixteen pixels that are (dx, dy) away from the splat's centre; 0 below its threshold (Eq. 3)."""
+    row = fma(record[FORM_C] * dy, dy, record[RECORD_LOG2_OPACITY])
+    log2_alpha = fma(fma(record[FORM_A], dx, record[FORM_B] * dy), dx, row)
+    return where_ge(log2_alpha, dx.of(_LOG2_MIN_ALPHA), exp2(log2_alpha), dx.of(0))
+
+
+def _plane_depth(record: Vectors, dx: Vector, dy: Vector) -> Vector:
+    return fma(record[SLOPE_U], dx, fma(record[SLOPE_V], dy, record[DEPTH]))
+
+
+@formula
+def _drawn(record: Vectors, px: Vector, py: Vector, T: Vector, sums: Vectors) -> tuple[Vector, Vectors]:
+    """A splat over sixteen pixels: the transmittance behind it, and features, depth and plane depth with it."""
+    dx, dy = px - record[U], py - record[V]
+    weight = _alpha(record, dx, dy) * T
+    shown = (*record[RECORD_FEATURE : RECORD_FEATURE + FEATURES], record[DEPTH], _plane_depth(record, dx, dy))
+    return T - weight, tuple(fma(weight, value, total) for value, total in zip(shown, sums, strict=True))
+
+
+@formula
+def _differentiated(
+    record: Vectors, dx: Vector, dy: Vector, T: Vector, remaining: Vector, D: Vectors, sums: Vectors
+) -> tuple[Vector, Vector, Vectors]:
+    """The way back: transmittance and remaining loss behind the splat, and the sums that `backward` tells."""
+    alpha = _alpha(record, dx, dy)
+    weight = alpha * T
+    *D_features, D_depth, D_plane, D_alpha = D
+    d = fma(_plane_depth(record, dx, dy), D_plane, fma(record[DEPTH], D_depth, D_alpha))
+    for feature, D_feature in zip(record[RECORD_FEATURE : RECORD_FEATURE + FEATURES], D_features, strict=True):
+        d = fma(feature, D_feature, d)
+    behind = remaining - weight * d
+    g = weight * d - behind * (alpha / (dx.of(1) - alpha))
+    gx, gy, weighted = g * dx, g * dy, weight * D_plane
+    s, sx, sy, sxx, sxy, syy, *s_features, s_depth, s_plane, s_plane_x, s_plane_y = sums
+    totals = (
+        s + g, sx + gx, sy + gy, fma(gx, dx, sxx), fma(gx, dy, sxy), fma(gy, dy, syy),
+        *(fma(weight, D_feature, total) for D_feature, total in zip(D_features, s_features, strict=True)),
+        fma(weight, D_depth, s_depth), s_plane + weighted, fma(weighted, dx, s_plane_x), fma(weighted, dy, s_plane_y),
+    )  # fmt: skip
+    return T - weight, behind, totals
+
+
+@inner
 def forward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, height, grid, local, lists, masks, planes):
     """Composite a range of tiles into `planes` and leave in `masks` the blocks that each pair drew.
 
@@ -101,7 +139,7 @@ def forward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, heigh
     blocks = carray(stack_floats(1792), TILE_FLOATS)
     local_masks, pair_of, block_list = lists[0], lists[1], lists[2]
     last_pair = np.int64(tile_ends[tile_ends.size - 1]) - 1
-    threshold, zero, one = spread(_LOG2_MIN_ALPHA), spread(np.float32(0)), spread(np.float32(1))
+    zero, one = spread(np.float32(0)), spread(np.float32(1))
     for tile in range(tile_from, tile_to):
         origin_x, origin_y = np.float32((tile % tiles_x) * TILE), np.float32((tile // tiles_x) * TILE)
         begin, end = np.int64(tile_ends[tile]), np.int64(tile_ends[tile + 1])
@@ -109,7 +147,9 @@ def forward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, heigh
         for pair in range(begin, end):
             prefetch(records, (pairs[min(pair + _AHEAD, last_pair)] & SPLAT) * RECORD)
             at = (pairs[pair] & SPLAT) * RECORD
-            touched = _blocks_touched(records, at, origin_x, origin_y, grid)
+            from_x, from_y = records[at + U] - origin_x, records[at + V] - origin_y
+            highest = _highest(load_spread(records, at, 8), load(grid, BLOCK_X) - from_x, load(grid, BLOCK_Y) - from_y)
+            touched = mask_ge(highest, spread(_LOG2_MIN_ALPHA - records[at + RECORD_LOG2_OPACITY]))
             masks[pair] = touched
             local_masks[count] = touched
             pair_of[count] = pair
@@ -122,41 +162,22 @@ def forward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, heigh
                 listed += append_where_bit(block_list, listed, local_masks, k, bit, np.int32(min(count - k, 16)))
                 k += 16
             px, py = load(grid, LANE_X) + (grid[BLOCK_X + block] + origin_x), load(grid, LANE_Y) + (grid[BLOCK_Y + block] + origin_y)
-            T, c0, c1, c2, c3, cz, cp = one, zero, zero, zero, zero, zero, zero
+            T, sums = one, (zero, zero, zero, zero, zero, zero)
             group = np.int64(0)
             while group < listed:
                 for j in range(group, min(group + 16, listed)):
-                    at = np.int64(block_list[j]) * RECORD
-                    dx, dy = px - local[at + U], py - local[at + V]
-                    row = fma(spread(local[at + FORM_C]) * dy, dy, spread(local[at + RECORD_LOG2_OPACITY]))
-                    log2_alpha = fma(fma(spread(local[at + FORM_A]), dx, spread(local[at + FORM_B]) * dy), dx, row)
-                    weight = where_ge(log2_alpha, threshold, exp2(log2_alpha), zero) * T
-                    T = T - weight
-                    z = spread(local[at + DEPTH])
-                    plane = fma(spread(local[at + SLOPE_U]), dx, fma(spread(local[at + SLOPE_V]), dy, z))
-                    c0 = fma(weight, spread(local[at + RECORD_FEATURE]), c0)
-                    c1 = fma(weight, spread(local[at + RECORD_FEATURE + 1]), c1)
-                    c2 = fma(weight, spread(local[at + RECORD_FEATURE + 2]), c2)
-                    c3 = fma(weight, spread(local[at + RECORD_FEATURE + 3]), c3)
-                    cz = fma(weight, z, cz)
-                    cp = fma(weight, plane, cp)
+                    T, sums = _drawn(load_spread(local, np.int64(block_list[j]) * RECORD, RECORD), px, py, T, sums)
                 group += 16
                 if group < listed and mask_ge(T, spread(_MIN_TRANSMITTANCE)) == 0:
                     for j in range(group, listed):
                         masks[pair_of[block_list[j]]] &= ~bit
                     break
-            out = block * 16
-            store(blocks, out, c0)
-            store(blocks, out + 256, c1)
-            store(blocks, out + 512, c2)
-            store(blocks, out + 768, c3)
-            store(blocks, out + 1024, cz)
-            store(blocks, out + 1280, cp)
-            store(blocks, out + 1536, one - T)
+            store_rows(blocks, block * 16, TILE_PIXELS, sums)
+            store(blocks, block * 16 + (CHANNELS - 1) * TILE_PIXELS, one - T)
         _from_blocks(blocks, tile, tiles_x, width, height, planes)
 
 
-@kept(njit(fastmath=MATH, **INNER))
+@inner
 def backward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, height, grid, masks, planes, d_planes, local, pair_sums):
     """Sums over pixels for each pair of a range of tiles, sixteen floats a slot, from the loss's derivative by the planes.
 
@@ -167,7 +188,7 @@ def backward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, heig
     d_blocks = carray(stack_floats(1792), TILE_FLOATS)
     transmittance, remaining = local[:TILE_PIXELS], local[TILE_PIXELS : 2 * TILE_PIXELS]
     last_pair = np.int64(tile_ends[tile_ends.size - 1]) - 1
-    threshold, zero, one = spread(_LOG2_MIN_ALPHA), spread(np.float32(0)), spread(np.float32(1))
+    zero, one = spread(np.float32(0)), spread(np.float32(1))
     lane_x, lane_y = load(grid, LANE_X), load(grid, LANE_Y)
     for tile in range(tile_from, tile_to):
         origin_x, origin_y = np.float32((tile % tiles_x) * TILE), np.float32((tile // tiles_x) * TILE)
@@ -180,49 +201,30 @@ def backward(tile_from, tile_to, tile_ends, pairs, records, tiles_x, width, heig
             prefetch_to_write(pair_sums, (ahead >> 32) * RECORD)
             at = (pairs[pair] & SPLAT) * RECORD
             from_center_x, from_center_y = lane_x - (records[at + U] - origin_x), lane_y - (records[at + V] - origin_y)
-            g, gx, gy, gxx, gxy, gyy = zero, zero, zero, zero, zero, zero
-            w0, w1, w2, w3, wz, wp, wpx, wpy = zero, zero, zero, zero, zero, zero, zero, zero
+            sums = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
             mask = masks[pair]
             while mask != 0:
                 block = trailing_zeros(mask)
                 mask &= mask - np.int32(1)
-                dx, dy = from_center_x + grid[BLOCK_X + block], from_center_y + grid[BLOCK_Y + block]
-                row = fma(spread(records[at + FORM_C]) * dy, dy, spread(records[at + RECORD_LOG2_OPACITY]))
-                log2_alpha = fma(fma(spread(records[at + FORM_A]), dx, spread(records[at + FORM_B]) * dy), dx, row)
-                alpha = where_ge(log2_alpha, threshold, exp2(log2_alpha), zero)
                 lanes = block * 16
-                T = load(transmittance, lanes)
-                weight = alpha * T
-                store(transmittance, lanes, T - weight)
-                D0, D1, D2, D3 = load(d_blocks, lanes), load(d_blocks, lanes + 256), load(d_blocks, lanes + 512), load(d_blocks, lanes + 768)
-                Dz, Dp = load(d_blocks, lanes + 1024), load(d_blocks, lanes + 1280)
-                z = spread(records[at + DEPTH])
-                plane = fma(spread(records[at + SLOPE_U]), dx, fma(spread(records[at + SLOPE_V]), dy, z))
-                d = fma(plane, Dp, fma(z, Dz, load(d_blocks, lanes + 1536)))
-                d = fma(spread(records[at + RECORD_FEATURE + 1]), D1, fma(spread(records[at + RECORD_FEATURE]), D0, d))
-                d = fma(spread(records[at + RECORD_FEATURE + 3]), D3, fma(spread(records[at + RECORD_FEATURE + 2]), D2, d))
-                behind = load(remaining, lanes) - weight * d
+                T, behind, sums = _differentiated(
+                    load_spread(records, at, RECORD), from_center_x + grid[BLOCK_X + block],
+                    from_center_y + grid[BLOCK_Y + block], load(transmittance, lanes), load(remaining, lanes),
+                    load_rows(d_blocks, lanes, TILE_PIXELS, CHANNELS), sums,
+                )  # fmt: skip
+                store(transmittance, lanes, T)
                 store(remaining, lanes, behind)
-                d_ln_alpha = weight * d - behind * (alpha / (one - alpha))
-                mx, my = d_ln_alpha * dx, d_ln_alpha * dy
-                g, gx, gy = g + d_ln_alpha, gx + mx, gy + my
-                gxx, gxy, gyy = fma(mx, dx, gxx), fma(mx, dy, gxy), fma(my, dy, gyy)
-                w0, w1, w2, w3 = fma(weight, D0, w0), fma(weight, D1, w1), fma(weight, D2, w2), fma(weight, D3, w3)
-                weighted = weight * Dp
-                wz, wp = fma(weight, Dz, wz), wp + weighted
-                wpx, wpy = fma(weighted, dx, wpx), fma(weighted, dy, wpy)
-            sums = lane_sums((g, gx, gy, gxx, gxy, gyy, w0, w1, w2, w3, wz, wp, wpx, wpy))
-            store(pair_sums, (pairs[pair] >> 32) * RECORD, sums)
+            store(pair_sums, (pairs[pair] >> 32) * RECORD, lane_sums(sums))
 
 
-@kept(njit(**INNER))
+@inner
 def _columns(tile, tiles_x, width, height, line):  # type: ignore[no-untyped-def]
     """Where a tile's row of pixels begins in a plane, and how many of its pixels are in the image."""
     x, y = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE + line
     return y * width + x, min(TILE, width - x) if y < height else 0
 
 
-@kept(njit(fastmath=MATH, **INNER))
+@inner
 def _from_blocks(blocks, tile, tiles_x, width, height, planes):
     """A tile's blocks to its pixels in the planes."""
     for line in range(0, TILE, 4):
@@ -240,7 +242,7 @@ def _from_blocks(blocks, tile, tiles_x, width, height, planes):
             store_first(planes, plane + at3, r3, n3)
 
 
-@kept(njit(fastmath=MATH, **INNER))
+@inner
 def _to_blocks(planes, d_planes, tile, tiles_x, width, height, d_blocks, products):
     """A tile's pixels of `d_planes` to blocks, and by pixel the product with `planes`, summed over the channels."""
     for line in range(0, TILE, 4):

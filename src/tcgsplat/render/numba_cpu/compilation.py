@@ -1,14 +1,38 @@
-"""How compiled kernels are kept: numba's cache is told of all the files that kernels here are made of.
+"""How kernels are compiled, side by side in several processes, and kept on disk.
 
 Numba keeps a compiled function until its own file changes. It does not look into the files of the functions and the
 constants that went into it, and would go on to use old ones, even where callers and callees no longer agree on their
 arguments. So what it remembers of a kernel's file here also says which sources there were.
 """
 
+import gc
 import hashlib
-from collections.abc import Callable
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from subprocess import DEVNULL, PIPE, Popen
+from threading import Thread
+from typing import Any, Final
+
+from numba import njit
+from numba.core import sigutils
+
+FLAGS: Final = ("contract", "nsz", "arcp")
+"""What arithmetic may do: contraction to fused multiply-adds, and reciprocals. No reassociation: the rounding trick of
+`simd.exp2` must survive."""
+_OPTIONS: Final[dict[str, Any]] = {
+    "fastmath": set(FLAGS),
+    "error_model": "numpy",
+    "nogil": True,
+    "no_cfunc_wrapper": True,
+}
+
+inner: Final = njit(**_OPTIONS | {"no_cpython_wrapper": True})
+"""Of functions that only kernels call and are kept with: without a way in from elsewhere and without machine code of
+their own they compile faster."""
 
 
 def _digest() -> str:
@@ -17,9 +41,9 @@ def _digest() -> str:
     patterns = (
         "render/numba_cpu/*.py",
         "*/*_kernels.py",
-        "render/protocol.py",
-        "mapping/optimizer.py",
-        "scene/gaussians.py",
+        "render/conventions.py",
+        "mapping/adam.py",
+        "scene/harmonics.py",
     )
     sources = sorted(path for pattern in patterns for path in package.glob(pattern))
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
@@ -28,13 +52,95 @@ def _digest() -> str:
 _SOURCES = _digest()
 
 
-def kept(decorator: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """A caching `njit(...)` that compiles anew when any of the sources is another."""
+def kernel(types: str) -> Callable[[Any], Any]:
+    """A kernel that Python calls, always with arguments of these types (as numba writes them: "f4[::1], i8").
+
+    It is compiled when it is first called, or by `compile_missing`, and anew when any of the sources is another.
+    """
 
     def decorate(function: Any) -> Any:
-        kernel = decorator(function)
-        index = kernel._cache._cache_file
+        dispatcher: Any = njit(**_OPTIONS, cache=True)(function)
+        index = dispatcher._cache._cache_file
         index._source_stamp = index._source_stamp, _SOURCES
-        return kernel
+        dispatcher.types, _ = sigutils.normalize_signature(f"({types},)")  # type: ignore[no-untyped-call]
+        return dispatcher
 
     return decorate
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A kernel by where it is, so that another process can find it."""
+
+    module: str
+    name: str
+
+    @property
+    def dispatcher(self) -> Any:
+        """What numba made of the function."""
+        return getattr(import_module(self.module), self.name)
+
+    @property
+    def kept(self) -> bool:
+        """Whether a compiled one is on disk."""
+        dispatcher = self.dispatcher
+        cache = dispatcher._cache
+        dispatcher.targetctx.refresh()
+        key = cache._index_key(dispatcher.types, dispatcher.targetctx.codegen())
+        return key in cache._cache_file._load_index()
+
+    def compile(self) -> None:
+        """Compile it and keep it on disk, if it is not there yet."""
+        dispatcher = self.dispatcher
+        dispatcher.compile(dispatcher.types)
+
+
+def kernels_of(modules: Sequence[str]) -> list[Kernel]:
+    """Every `kernel` that is defined in these modules."""
+    found = []
+    for module in modules:
+        for name, value in vars(import_module(module)).items():
+            if hasattr(value, "types") and hasattr(value, "py_func") and value.py_func.__module__ == module:
+                found.append(Kernel(module, name))
+    return found
+
+
+def compile_missing(kernels: Sequence[Kernel], processes: int) -> None:
+    """Compile kernels in this process and in others beside it, which import nothing but kernels.
+
+    Numba has one lock around its compiler, so threads would wait for each other. What another process could not do,
+    for whatever reason, is left to this one's first call.
+    """
+    left = iter(kernels)
+    helpers = [Thread(target=_compile_elsewhere, args=(left,)) for _ in range(min(processes, len(kernels)) - 1)]
+    for helper in helpers:
+        helper.start()
+    for kernel in left:
+        kernel.compile()
+    for helper in helpers:
+        helper.join()
+
+
+def _compile_elsewhere(kernels: Iterator[Kernel]) -> None:
+    """Have another process compile one kernel after the other, until none is left or it fails."""
+    command = [sys.executable, "-c", f"import {__name__} as compilation; compilation.compile_as_told()"]
+    with Popen(command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, text=True) as other:
+        assert other.stdin is not None
+        assert other.stdout is not None
+        for kernel in kernels:
+            try:
+                other.stdin.write(f"{kernel.module} {kernel.name}\n")
+                other.stdin.flush()
+            except BrokenPipeError:
+                return
+            if not other.stdout.readline():
+                return
+
+
+def compile_as_told() -> None:
+    """Compile the kernels that are named on standard input, a line each, and answer each with a line."""
+    gc.disable()
+    for line in sys.stdin:
+        Kernel(*line.split()).compile()
+        os.write(sys.stdout.fileno(), b"compiled\n")
+    os._exit(0)  # taking the compiler down properly takes half a second

@@ -4,12 +4,10 @@ Between `arrange` and `composite` Python makes room for as many (splat, tile) pa
 """
 
 import numpy as np
-from numba import njit
 
 from tcgsplat.render.numba_cpu import blending, projection, tiling
-from tcgsplat.render.numba_cpu.compilation import kept
-from tcgsplat.render.numba_cpu.phases import WAITING, next_unit
-from tcgsplat.render.numba_cpu.simd import INNER, KERNEL
+from tcgsplat.render.numba_cpu.compilation import inner, kernel
+from tcgsplat.render.numba_cpu.phases import BEGIN, DONE, WAITING, next_unit
 
 UNIT = 1024
 """Splats in a unit of projection and of the chain rule. Fixed, because pose sums are made unit by unit."""
@@ -17,6 +15,8 @@ TILES = 2
 """Tiles in a unit of compositing: side by side, so that the second finds splats of the first in the cache."""
 SPARE = 8
 """Places after the pairs for each strip: a cache line."""
+
+_VISIBLE, _PAIRS = np.int64(0), np.int64(1)  # columns of `tiling.tally`
 
 # Phases of `arrange`. Each digit of the sorting keys is counted, placed and moved; LIST counts the first.
 PROJECT, LIST, DIGITS = 0, 1, 4
@@ -27,7 +27,7 @@ FILL, FORWARD = 0, 1
 BACKWARD, CHAIN = 0, 1
 
 
-@kept(njit(**INNER))
+@inner
 def _before(unit_sums, unit, column):  # type: ignore[no-untyped-def]
     total = np.int64(0)
     for k in range(unit):
@@ -35,7 +35,9 @@ def _before(unit_sums, unit, column):  # type: ignore[no-untyped-def]
     return total
 
 
-@kept(njit(**KERNEL))
+@kernel(
+    "i8[::1], i8, f4[::1], i8, f4[::1], i8, f4[::1], f4[::1], i4[::1], u4[::1], i8[:, ::1], u4[::1], i8[::1], i8[::1], u4[:, ::1], i4[::1], u4[:, ::1], i4[::1]"
+)
 def arrange(
     progress, last_phase, P, n, cam, tiles_x, records, depths, depth_bits, rectangles, unit_sums, slot_starts, entries,
     swapped, digit_counts, digit_ends, tile_counts, tile_ends,
@@ -50,7 +52,7 @@ def arrange(
         digit, step = (phase - LIST) // 3, (phase - LIST) % 3
         shift = min(32 + tiling.DIGIT_BITS * digit, 63)  # a fourth digit is 0 for all
         if phase == LIST:
-            visible, digits = _before(unit_sums, units, 0), tiling.used_digits(unit_sums)
+            visible, digits = _before(unit_sums, units, _VISIBLE), tiling.used_digits(unit_sums)
         if phase == PROJECT:
             count = units
         elif phase == PLACE_TILES:
@@ -59,7 +61,7 @@ def arrange(
             count = strips
         else:
             count = 0 if digit >= digits else (1 if step == 1 else strips)
-        k = next_unit(progress, phase, count, 0)
+        k = next_unit(progress, phase, count, BEGIN)
         while k >= 0:
             start, stop = visible * k // strips, visible * (k + 1) // strips
             unit, unit_after = units * k // strips, units * (k + 1) // strips
@@ -68,7 +70,7 @@ def arrange(
                 projection.forward(P, start, stop, cam, tiles_x, records, depths, rectangles)
                 tiling.tally(start, stop, depth_bits, rectangles, unit_sums[k])
             elif phase == LIST:
-                at, slot = _before(unit_sums, unit, 0), _before(unit_sums, unit, 1)
+                at, slot = _before(unit_sums, unit, _VISIBLE), _before(unit_sums, unit, _PAIRS)
                 tiling.list_visible(
                     unit * UNIT, min(unit_after * UNIT, n), at, slot, depth_bits, rectangles, entries, digit_counts[k],
                     slot_starts,
@@ -87,15 +89,17 @@ def arrange(
                     tiling.count_digits(source, start, stop, shift, digit_counts[k])
                 else:
                     if digit == 0:
-                        start, stop = _before(unit_sums, unit, 0), _before(unit_sums, unit_after, 0)
+                        start, stop = _before(unit_sums, unit, _VISIBLE), _before(unit_sums, unit_after, _VISIBLE)
                     tiling.move(source, start, stop, shift, digit_counts[k], target)
-            k = next_unit(progress, phase, count, 1)
+            k = next_unit(progress, phase, count, DONE)
         if k == WAITING:
             return False
     return True
 
 
-@kept(njit(**KERNEL))
+@kernel(
+    "i8[::1], i8, i8[::1], i8, u4[::1], u4[::1], i8, u4[:, ::1], i4[::1], i8[::1], f4[::1], i8, i8, f4[::1], f4[::1], i4[:, ::1], i4[::1], f4[::1]"
+)
 def composite(
     progress, last_phase, entries, visible, rectangles, slot_starts, tiles_x, tile_counts, tile_ends, pairs, records,
     width, height, grid, local, lists, masks, planes,
@@ -104,7 +108,7 @@ def composite(
     strips, tiles = tile_counts.shape[0], tile_ends.size - 1
     for phase in range(last_phase + 1):
         count = strips if phase == FILL else -(-tiles // TILES)
-        k = next_unit(progress, phase, count, 0)
+        k = next_unit(progress, phase, count, BEGIN)
         while k >= 0:
             if phase == FILL:
                 tiling.fill_tiles(
@@ -116,13 +120,15 @@ def composite(
                     k * TILES, min((k + 1) * TILES, tiles), tile_ends, pairs, records, tiles_x, width, height, grid,
                     local, lists, masks, planes,
                 )  # fmt: skip
-            k = next_unit(progress, phase, count, 1)
+            k = next_unit(progress, phase, count, DONE)
         if k == WAITING:
             return False
     return True
 
 
-@kept(njit(**KERNEL))
+@kernel(
+    "i8[::1], i8, i4[::1], i8[::1], f4[::1], i8, i8, i8, f4[::1], i4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], i8, f4[::1], u4[::1], f4[::1], f4[:, ::1]"
+)
 def differentiate(
     progress, last_phase, tile_ends, pairs, records, tiles_x, width, height, grid, masks, planes, d_planes, local,
     pair_sums, P, n, cam, slot_starts, grads, pose_sums,
@@ -131,7 +137,7 @@ def differentiate(
     tiles = tile_ends.size - 1
     for phase in range(last_phase + 1):
         count = -(-tiles // TILES) if phase == BACKWARD else pose_sums.shape[0]
-        k = next_unit(progress, phase, count, 0)
+        k = next_unit(progress, phase, count, BEGIN)
         while k >= 0:
             if phase == BACKWARD:
                 blending.backward(
@@ -142,7 +148,7 @@ def differentiate(
                 projection.backward(
                     P, n, k * UNIT, min((k + 1) * UNIT, n), cam, slot_starts, pair_sums, grads, pose_sums[k]
                 )
-            k = next_unit(progress, phase, count, 1)
+            k = next_unit(progress, phase, count, DONE)
         if k == WAITING:
             return False
     return True

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.conventions import JACOBIAN_MARGIN
 from tcgsplat.render.numba_cpu import pass_kernels as kernels
 from tcgsplat.render.numba_cpu import projection, tiling
 from tcgsplat.render.numba_cpu.blending import BACKWARD_FLOATS
@@ -33,7 +34,6 @@ from tcgsplat.render.numba_cpu.layout import (
 )
 from tcgsplat.render.numba_cpu.phases import COUNTERS
 from tcgsplat.render.numba_cpu.workers import Arguments, Workers, available_cores
-from tcgsplat.render.protocol import JACOBIAN_MARGIN
 
 _KEPT = 2
 """Workspaces kept for later: one for mapping, one for tracking at the same time."""

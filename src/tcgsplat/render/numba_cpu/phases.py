@@ -11,16 +11,17 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
 
-from tcgsplat.render.numba_cpu.compilation import kept
-from tcgsplat.render.numba_cpu.simd import INNER
+from tcgsplat.render.numba_cpu.compilation import inner
 
 OVER, WAITING = -1, -2
 """What `next_unit` gives when there is no unit: all are finished, or others have been working on some for long."""
+BEGIN, DONE = np.int64(0), np.int64(1)
+"""What `next_unit` is told: whether the caller has just finished a unit. (Of literal numbers numba would compile each.)"""
 COUNTERS = 16
 """Integers of `progress` for each phase: units taken and, on another cache line, units finished."""
 _FINISHED = 8
@@ -56,9 +57,9 @@ def _look(typingctx: Any, array: Any, index: Any) -> Any:
     return types.int64(array, types.int64), lower
 
 
-@kept(njit(**INNER))
+@inner
 def next_unit(progress, phase, units, finished):  # type: ignore[no-untyped-def]
-    """The next of a phase's units (0 .. units-1), or OVER, or WAITING. `finished`: the caller has just done one (0 or 1)."""
+    """The next of a phase's units (0 .. units-1), or OVER, or WAITING; `finished` is BEGIN or DONE."""
     at = np.int64(phase) * COUNTERS
     if finished:
         _add(progress, at + _FINISHED)

@@ -7,12 +7,11 @@ Places are kept in unsigned integers, which as indices need no test for the end 
 """
 
 import numpy as np
-from numba import njit
 
-from tcgsplat.render.numba_cpu.compilation import kept
+from tcgsplat.render.conventions import NEAR_PLANE
+from tcgsplat.render.numba_cpu.compilation import inner
+from tcgsplat.render.numba_cpu.lanes import prefetch
 from tcgsplat.render.numba_cpu.layout import SPAN_UNIT, SPLAT
-from tcgsplat.render.numba_cpu.simd import INNER, prefetch
-from tcgsplat.render.protocol import NEAR_PLANE
 
 DIGIT_BITS = 13
 DIGIT_VALUES = 1 << DIGIT_BITS
@@ -22,7 +21,7 @@ _BEYOND_TWO = ~(1 | SPAN_UNIT)
 _NEAREST = int(np.float32(NEAR_PLANE).view(np.int32))
 
 
-@kept(njit(**INNER))
+@inner
 def tally(start, stop, depth_bits, rectangles, sums):  # type: ignore[no-untyped-def]
     """Of a range: visible splats, (splat, tile) pairs, and the largest sorting key."""
     visible, pairs, largest = np.int64(0), np.int64(0), np.int64(0)
@@ -35,7 +34,7 @@ def tally(start, stop, depth_bits, rectangles, sums):  # type: ignore[no-untyped
     sums[0], sums[1], sums[2] = visible, pairs, largest
 
 
-@kept(njit(**INNER))
+@inner
 def used_digits(sums):  # type: ignore[no-untyped-def]
     """How many digits to sort by: an even number, so that the entries end where they began; two nearly always."""
     largest = np.int64(0)
@@ -44,7 +43,7 @@ def used_digits(sums):  # type: ignore[no-untyped-def]
     return 4 if largest >> (2 * DIGIT_BITS) else 2
 
 
-@kept(njit(**INNER))
+@inner
 def list_visible(start, stop, at, slot, depth_bits, rectangles, entries, counts, slot_starts):  # type: ignore[no-untyped-def]
     """List the visible splats of a range from `entries[at]` on, count their keys' first digits, and number their slots.
 
@@ -64,7 +63,7 @@ def list_visible(start, stop, at, slot, depth_bits, rectangles, entries, counts,
     slot_starts[stop] = slot
 
 
-@kept(njit(**INNER))
+@inner
 def count_digits(entries, start, stop, shift, counts):  # type: ignore[no-untyped-def]
     """How often each value of the digit at bit `shift` occurs in a range."""
     counts[:] = 0
@@ -72,7 +71,7 @@ def count_digits(entries, start, stop, shift, counts):  # type: ignore[no-untype
         counts[(entries[j] >> shift) & _DIGIT_MASK] += 1
 
 
-@kept(njit(**INNER))
+@inner
 def places(counts, ends):  # type: ignore[no-untyped-def]
     """Turn each strip's counts of values into the places of its first items, by value, then strip.
 
@@ -88,7 +87,7 @@ def places(counts, ends):  # type: ignore[no-untyped-def]
         ends[value + 1] = total
 
 
-@kept(njit(**INNER))
+@inner
 def move(entries, start, stop, shift, cursors, moved):  # type: ignore[no-untyped-def]
     """Put a range's entries to their places by one digit."""
     for j in range(start, stop):
@@ -99,7 +98,7 @@ def move(entries, start, stop, shift, cursors, moved):  # type: ignore[no-untype
         moved[place] = entry
 
 
-@kept(njit(**INNER))
+@inner
 def count_tiles(entries, start, stop, rectangles, tiles_x, counts):  # type: ignore[no-untyped-def]
     """How many splats of a range each tile has.
 
@@ -124,7 +123,7 @@ def count_tiles(entries, start, stop, rectangles, tiles_x, counts):  # type: ign
                     counts[tile] += 1
 
 
-@kept(njit(**INNER))
+@inner
 def fill_tiles(entries, start, stop, rectangles, slot_starts, tiles_x, cursors, pairs):  # type: ignore[no-untyped-def]
     """List a range's splats in their tiles. A pair is a slot over a splat; each of a splat's pairs has its own slot.
 
