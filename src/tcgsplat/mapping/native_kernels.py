@@ -11,9 +11,11 @@ import numpy as np
 
 from tcgsplat.mapping.adam import BETA_1, BETA_2, EPSILON
 from tcgsplat.render.conventions import MAX_OPACITY
+from tcgsplat.render.numba_cpu import blending, projection
 from tcgsplat.render.numba_cpu.compilation import inner, kernel
 from tcgsplat.render.numba_cpu.lanes import load, load_rows, mask_ge, store, store_rows
 from tcgsplat.render.numba_cpu.layout import FEATURE, LOG2_OPACITY, MEAN, PARAMETERS, QUAT, SCALE
+from tcgsplat.render.numba_cpu.pass_kernels import TILES
 from tcgsplat.render.numba_cpu.phases import BEGIN, DONE, WAITING, next_unit
 from tcgsplat.render.numba_cpu.simd import (
     Vector,
@@ -36,13 +38,14 @@ from tcgsplat.scene.harmonics import SH_C0
 LOG_SCALE, LOGIT, SH = SCALE, LOG2_OPACITY, FEATURE
 ROWS = SH + 3
 
-# Constants of `adam_step`, after the learning rate of every row.
+# Constants of a step, after the learning rate of every row.
 SCALE_WEIGHT, ROTATION_WEIGHT, STABILITY_WEIGHT = ROWS, ROWS + 1, ROWS + 2
 CONSTANTS = ROWS + 3
 
-_ONLY_PHASE = np.int64(0)
-UNIT = 2048
-"""Gaussians that a thread takes at a time."""
+BACKWARD, STEP = 0, 1
+"""Phases of `step`."""
+UNIT = 512
+"""Gaussians that a thread takes at a time: their derivatives stay in the nearest cache."""
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _LOG2E = np.float32(1 / math.log(2))
@@ -173,7 +176,7 @@ def _stepped(
 def _adam_step(start, stop, raw, P, before, first, second, clocks, grads, depths, allowed, scale, constants, excess):
     """One Adam step of the visible Gaussians of a range, on the losses of the pixels and of Eq. 23.
 
-    Visible are those whose depth is not 0. `grads` holds the derivatives by `P`; they are led on to the raw parameters.
+    Visible are those whose depth is not 0. `grads` holds the derivatives by the range's `P`; they are led on to the raw parameters.
     `clocks` are two rows a block: what is left of beta^t of either moment, for each Gaussian's own count t of steps.
     `allowed` is the self-distance up to which Eq. 23 costs nothing (infinite where it does not apply), `scale` the
     factor of Eq. 24 on the geometry's steps; `excess` receives what Eq. 23 sums for each Gaussian, in metres.
@@ -197,7 +200,7 @@ def _adam_step(start, stop, raw, P, before, first, second, clocks, grads, depths
         _, _, cosine, inverse, inverse_before = changes
         for row in range(ROWS):
             at, at_P = ROWS * i + 16 * row, PARAMETERS * i + 16 * row
-            value, g, rate = load(raw, at), load(grads, at_P), spread(constants[row])
+            value, g, rate = load(raw, at), load(grads, at_P - PARAMETERS * start), spread(constants[row])
             if row < QUAT:
                 g = fma(by_mean, value - load(before, at), g)
             elif row < LOG_SCALE:
@@ -217,17 +220,36 @@ def _adam_step(start, stop, raw, P, before, first, second, clocks, grads, depths
         activate(raw, P, i, i + 16)
 
 
-@kernel("i8[::1], i8, f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1]")
-def adam_step(
-    progress, n, raw, P, before, first, second, clocks, grads, depths, allowed, scale, constants, excess
+@kernel("i8[::1], i8, i4[::1], i8[::1], f4[::1], i8, i8, i8, f4[::1], i4[::1], f4[::1], f4[::1], f4[::1], f4[::1], u4[::1], f4[::1], f4[::1], f4[::1], i8, f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1]")
+def step(
+    progress, last_phase, tile_ends, pairs, records, tiles_x, width, height, grid, masks, planes, d_planes, local,
+    pair_sums, slot_starts, cam, grads, pose, n, raw, P, before, first, second, clocks, depths, allowed, scale,
+    constants, excess,
 ):
-    """`_adam_step` for all Gaussians, shared by threads in units. False: has waited for long."""
-    units = -(-n // UNIT)
-    k = next_unit(progress, _ONLY_PHASE, units, BEGIN)
-    while k >= 0:
-        _adam_step(
-            k * UNIT, min((k + 1) * UNIT, n), raw, P, before, first, second, clocks, grads, depths, allowed, scale,
-            constants, excess,
-        )
-        k = next_unit(progress, _ONLY_PHASE, units, DONE)
-    return k != WAITING
+    """From `d_planes` to the next parameters of all Gaussians. False: has waited for long.
+
+    The arguments up to `local` are those of `blending.backward`, from `slot_starts` to `pose` of `projection.backward`,
+    the others of `_adam_step`. Derivatives by parameters live from the one to the other in `grads`, a worker's own for
+    one unit: to write them all to memory and to read them again would take longer than either. The pose stays.
+    """
+    tiles = tile_ends.size - 1
+    for phase in range(last_phase + 1):
+        count = -(-tiles // TILES) if phase == BACKWARD else -(-n // UNIT)
+        k = next_unit(progress, phase, count, BEGIN)
+        while k >= 0:
+            if phase == BACKWARD:
+                blending.backward(
+                    k * TILES, min((k + 1) * TILES, tiles), tile_ends, pairs, records, tiles_x, width, height, grid,
+                    masks, planes, d_planes, local, pair_sums,
+                )
+            else:
+                start, stop = k * UNIT, min((k + 1) * UNIT, n)
+                projection.backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, start, pose)
+                _adam_step(
+                    start, stop, raw, P, before, first, second, clocks, grads, depths, allowed, scale, constants,
+                    excess,
+                )
+            k = next_unit(progress, phase, count, DONE)
+        if k == WAITING:
+            return False
+    return True

@@ -26,6 +26,7 @@ from tcgsplat.render.numba_cpu.layout import (
     to_blocks,
 )
 from tcgsplat.render.numba_cpu.passes import Drawn, Passes, Workspace
+from tcgsplat.render.numba_cpu.projection import POSE_SUMS
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag
@@ -96,15 +97,11 @@ class NativeOptimization:
         target = self._view(view)
         drawn = self._passes.draw(self._parameters, target.camera, target.T_cam_map)
         d_planes = self._differentiated_losses(target, drawn.planes)
-        grads = self._space.floats("grads", *self._parameters.shape)
-        self._passes.differentiate(drawn, d_planes, grads)
         self._stability_weight = self._confidence.stability_weight / self._count(drawn)
-        arrays = (
-            self._padded, _flat(self._raw), _flat(self._parameters), _flat(self._before), _flat(self._first),
-            _flat(self._second), _flat(self._clocks), _flat(grads), drawn.depths, self._allowed, self._scale,
-            self._constants(pace), self._excess,
+        stepped(
+            self._passes, self._space, drawn, d_planes, self._raw, self._before, self._first, self._second,
+            self._clocks, self._allowed, self._scale, self._constants(pace), self._excess,
         )  # fmt: skip
-        self._share(kernels.adam_step, 1, lambda _: arrays)
 
     def prune(self) -> None:
         """See `Optimization`. Rows stay where they are until the end; a faint one is simply never drawn again."""
@@ -221,6 +218,28 @@ class NativeOptimization:
         config = self._confidence
         weights = [config.scale_change_weight, config.rotation_change_weight, self._stability_weight]
         return np.concatenate((np.float32(pace) * self._rates, np.array(weights, np.float32)))
+
+
+def stepped(passes: Passes, space: Workspace, drawn: Drawn, d_planes: Floats, raw: Floats, *adam: Floats) -> None:
+    """Differentiate a drawing, and a step of `raw` and of the parameters that were drawn; see `native_kernels.step`.
+
+    `adam` is what the kernel takes from `before` on, but for the depths, which the drawing has.
+    """
+    blending, pair_sums = passes.blending_backward(drawn, d_planes)
+    threads = passes.workers.threads
+    grads, pose = space.floats("grads", threads, kernels.UNIT * PARAMETERS), space.floats("pose", threads, POSE_SUMS)
+    before, first, second, clocks, *rows = (_flat(array) for array in adam)
+    shared = (
+        drawn.padded, _flat(raw), drawn.parameters, before, first, second, clocks, drawn.depths, *rows
+    )  # fmt: skip
+    passes.run(
+        kernels.step,
+        {"backward": kernels.BACKWARD, "step": kernels.STEP},
+        lambda worker: (
+            *blending(worker), pair_sums, drawn.slot_starts, drawn.camera_vector, grads[worker], pose[worker], *shared,
+        ),
+        drawn.workspace,
+    )  # fmt: skip
 
 
 def _flat(array: Floats) -> Floats:

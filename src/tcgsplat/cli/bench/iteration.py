@@ -1,12 +1,10 @@
 """An iteration of mapping's optimisation as its kernels run it, once the loss has been differentiated by the images."""
 
-from functools import partial
-
 import numpy as np
 
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.mapping import native_kernels as kernels
-from tcgsplat.mapping.native_optimization import filled, packed
+from tcgsplat.mapping.native_optimization import filled, packed, stepped
 from tcgsplat.render.numba_cpu.layout import CHANNELS, FEATURE, PARAMETERS, Floats, to_blocks
 from tcgsplat.render.numba_cpu.passes import Drawn, Passes, Workspace
 from tcgsplat.render.protocol import Splats
@@ -42,14 +40,10 @@ class Iteration:
     def step(self) -> None:
         """Draw, differentiate, and Adam for what was drawn."""
         drawn = self.draw()
-        grads = self._space.floats("grads", *self.parameters.shape)
-        self._passes.differentiate(drawn, self._d_planes, grads)
-        arrays = (
-            self._padded, self.raw.reshape(-1), self.parameters.reshape(-1), self._before.reshape(-1),
-            self.first.reshape(-1), self.second.reshape(-1), self._clocks.reshape(-1), grads.reshape(-1),
-            drawn.depths, self._allowed, self._scale, self._constants, self._excess,
+        stepped(
+            self._passes, self._space, drawn, self._d_planes, self.raw, self._before, self.first, self.second,
+            self._clocks, self._allowed, self._scale, self._constants, self._excess,
         )  # fmt: skip
-        self._passes.workers.share(partial(kernels.adam_step, self._space.progress(1)), lambda _: arrays)
 
     def draw(self) -> Drawn:
         """The forward pass alone."""

@@ -34,12 +34,10 @@ TREE_CYCLES = 11
 _FLOAT = 4
 PROJECT_BYTES = _FLOAT * (PARAMETERS + RECORD + 1 + 4)
 """A splat: its parameters are read; its record, depth and rectangle of tiles are written."""
-CHAIN_BYTES = _FLOAT * (FEATURE + PARAMETERS)
-"""A splat: its parameters but for the features are read; all derivatives are written."""
 SUMS_BYTES = _FLOAT * (RECORD + 1)
-"""A (splat, tile) pair: its sums and its place are read, in the same stage."""
-ADAM_BYTES = _FLOAT * PARAMETERS * 7
-"""A splat: parameters, derivatives and two moments are read; parameters and moments are written."""
+"""A (splat, tile) pair: its sums and its place are read, in the same stage as what follows."""
+STEP_BYTES = _FLOAT * (FEATURE + PARAMETERS * 6)
+"""A splat: what was drawn of it, but for the features, is read; parameters and two moments are read and written."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +106,6 @@ def floors(needs: Needs, machine: Machine) -> dict[str, float]:
         "project": machine.stream_seconds(PROJECT_BYTES * needs.splats),
         "forward": FORWARD_OPERATIONS * needs.blocks / vectors,
         "backward": BACKWARD_OPERATIONS * needs.blocks / vectors + TREE_CYCLES * needs.pairs / cycles,
-        "chain": machine.stream_seconds(CHAIN_BYTES * needs.splats + SUMS_BYTES * needs.pairs),
-        "adam": machine.stream_seconds(ADAM_BYTES * needs.splats),
+        "step": machine.stream_seconds(STEP_BYTES * needs.splats + SUMS_BYTES * needs.pairs),
     }
     return {stage: 1000.0 * duration for stage, duration in seconds.items()}

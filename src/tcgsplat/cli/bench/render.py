@@ -157,12 +157,13 @@ def measured(size: Size, repeats: int, able: Machine, warm_up: int = 3) -> Resul
 def timed(size: Size, splats: Splats, repeats: int, threads: int, warm_up: int = 3) -> dict[str, Times]:
     """Each stage of an iteration; and the whole, in runs of its own where threads do not meet between stages."""
     stages, whole = Stopwatch(), Stopwatch()
-    for watch, last, passes in ((stages, "adam", Passes(threads, stages.lap)), (whole, "iteration", Passes(threads))):
+    for watch, passes in ((stages, Passes(threads, stages.lap)), (whole, Passes(threads))):
         iteration = Iteration(splats, size.camera, passes)
         for _ in range(warm_up + repeats):
             watch.start()
             iteration.step()
-            watch.lap(last)
+            if watch is whole:
+                watch.lap("iteration")
     runs = [{**one, **other} for one, other in zip(stages.runs, whole.runs, strict=True)][warm_up:]
     return {stage: Times.of([run[stage] for run in runs]) for stage in runs[0]}
 

@@ -1,4 +1,4 @@
-"""The passes as three kernels, each of several phases that threads share; see `phases.py`.
+"""The forward pass as two kernels, each of several phases that threads share; see `phases.py`.
 
 Between `arrange` and `composite` Python makes room for as many (splat, tile) pairs as there are.
 """
@@ -22,9 +22,8 @@ _VISIBLE, _PAIRS = np.int64(0), np.int64(1)  # columns of `tiling.tally`
 PROJECT, LIST, DIGITS = 0, 1, 4
 COUNT_TILES = LIST + 3 * DIGITS
 PLACE_TILES = COUNT_TILES + 1
-# Phases of `composite` and of `differentiate`.
+# Phases of `composite`.
 FILL, FORWARD = 0, 1
-BACKWARD, CHAIN = 0, 1
 
 
 @inner
@@ -120,34 +119,6 @@ def composite(
                     k * TILES, min((k + 1) * TILES, tiles), tile_ends, pairs, records, tiles_x, width, height, grid,
                     local, lists, masks, planes,
                 )  # fmt: skip
-            k = next_unit(progress, phase, count, DONE)
-        if k == WAITING:
-            return False
-    return True
-
-
-@kernel(
-    "i8[::1], i8, i4[::1], i8[::1], f4[::1], i8, i8, i8, f4[::1], i4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], i8, f4[::1], u4[::1], f4[::1], f4[:, ::1]"
-)
-def differentiate(
-    progress, last_phase, tile_ends, pairs, records, tiles_x, width, height, grid, masks, planes, d_planes, local,
-    pair_sums, P, n, cam, slot_starts, grads, pose_sums,
-):  # type: ignore[no-untyped-def]  # fmt: skip
-    """From `d_planes` to the sums of all pairs, to `grads` and to each unit's `pose_sums`. False: has waited for long."""
-    tiles = tile_ends.size - 1
-    for phase in range(last_phase + 1):
-        count = -(-tiles // TILES) if phase == BACKWARD else pose_sums.shape[0]
-        k = next_unit(progress, phase, count, BEGIN)
-        while k >= 0:
-            if phase == BACKWARD:
-                blending.backward(
-                    k * TILES, min((k + 1) * TILES, tiles), tile_ends, pairs, records, tiles_x, width, height, grid,
-                    masks, planes, d_planes, local, pair_sums,
-                )  # fmt: skip
-            else:
-                projection.backward(
-                    P, n, k * UNIT, min((k + 1) * UNIT, n), cam, slot_starts, pair_sums, grads, pose_sums[k]
-                )
             k = next_unit(progress, phase, count, DONE)
         if k == WAITING:
             return False

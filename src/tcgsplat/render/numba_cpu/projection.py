@@ -263,11 +263,11 @@ def _chained(cam: Vectors, point: Vectors, quat: Vectors, scales: Vectors, sums:
 
 
 @inner
-def backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, pose):
+def backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, first, pose):
     """From each pair's sums over its pixels to derivatives by a range's parameters and by the pose.
 
     Splat i's pairs have the rows `slot_starts[i]` .. `slot_starts[i + 1]` of sixteen floats (see `blending.backward`);
-    `grads` is laid out like the parameters; `pose` receives POSE_SUMS numbers.
+    `grads` is laid out like the parameters from splat `first` on; `pose` receives POSE_SUMS numbers.
     """
     zero, sums, totals = spread(_ZERO), carray(stack_floats(256), 256), carray(stack_floats(192), 192)
     last_slot = np.int64(slot_starts[n]) - 1
@@ -277,7 +277,7 @@ def backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, pose):
         at = PARAMETERS * i
         if slot_starts[i] == slot_starts[i + 16]:
             for row in range(PARAMETERS):
-                store(grads, at + 16 * row, zero)
+                store(grads, at - PARAMETERS * first + 16 * row, zero)
             continue
         for k in range(16):
             slot, end = np.int64(slot_starts[i + k]), np.int64(slot_starts[i + k + 1])
@@ -295,7 +295,7 @@ def backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, pose):
             load_spread(cam, 0, CAMERA), load_rows(P, at + 16 * MEAN, 16, 3), load_rows(P, at + 16 * QUAT, 16, 4),
             load_rows(P, at + 16 * SCALE, 16, 3), load_transposed(sums, 0),
         )  # fmt: skip
-        store_rows(grads, at, 16, by_parameters)
+        store_rows(grads, at - PARAMETERS * first, 16, by_parameters)
         add_rows(totals, 0, 16, by_pose)
     store(sums, 0, lane_sums(load_rows(totals, 0, 16, POSE_SUMS)))
     for k in range(POSE_SUMS):
