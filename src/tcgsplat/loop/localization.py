@@ -10,10 +10,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy  # its parts when they are used: together they are a tenth of the start-up
 import torch
 from jaxtyping import Bool, Float64, Int64
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
@@ -148,7 +147,9 @@ def _expected(
     rows = np.flatnonzero(points[:, 2] > _NEAR)
     x, y, z = points[rows].T
     seen = np.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), axis=1)
-    near = cKDTree(a.pixels).sparse_distance_matrix(cKDTree(seen), radius, output_type="coo_matrix")
+    near = scipy.spatial.cKDTree(a.pixels).sparse_distance_matrix(
+        scipy.spatial.cKDTree(seen), radius, output_type="coo_matrix"
+    )
     i, j = near.row.astype(np.int64), rows[near.col]
     differing = a.descriptors[i].view(np.uint64) ^ b.descriptors[j].view(np.uint64)
     bits = np.bitwise_count(differing).sum(axis=1, dtype=np.int64)
@@ -241,7 +242,7 @@ class _Measurements:
             shifts += translations
         poses = np.tile(np.eye(4), (len(turns), 1, 1))
         if turns:
-            poses[:, :3, :3] = Rotation.from_rotvec(np.stack(turns)[:, :, 0]).as_matrix()
+            poses[:, :3, :3] = scipy.spatial.transform.Rotation.from_rotvec(np.stack(turns)[:, :, 0]).as_matrix()
             poses[:, :3, 3] = np.stack(shifts)[:, :, 0]
         return poses[np.isfinite(poses).all(axis=(1, 2))]
 

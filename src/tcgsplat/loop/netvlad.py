@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
+import scipy  # its parts when they are used: together they are a tenth of the start-up
 import torch
 from jaxtyping import Float, Float32
 from torch import Tensor, nn

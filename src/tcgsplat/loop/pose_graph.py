@@ -15,11 +15,9 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+import scipy  # its parts when they are used: together they are a tenth of the start-up
 import torch
 from jaxtyping import Bool, Float, Float64
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components
-from scipy.special import gammaincinv
 from torch import Tensor
 
 from tcgsplat.geometry import se3
@@ -98,7 +96,9 @@ def solved(T_world_map: Sequence[Pose], edges: Sequence[Edge], *, inlier_probabi
     order = sorted(range(len(edges)), key=lambda place: _name(edges[place]))
     loops = [place for place in order if edges[place].loop]
     graph = _Graph.of(T_world_map, [edges[place] for place in order])
-    limit = 2.0 * float(gammaincinv(3.0, inlier_probability))  # the quantile of chi2 with six degrees of freedom
+    limit = 2.0 * float(
+        scipy.special.gammaincinv(3.0, inlier_probability)
+    )  # the quantile of chi2 with six degrees of freedom
 
     state = graph.given(believed=frozenset())
     poses = tuple(T_world_map)
@@ -208,7 +208,7 @@ class _Graph:
         graph = self.factors(frozenset(range(len(self.loops))))
         row, column, entry = graph.linearize(values).sparseJacobian_()  # A, b: every factor has six rows
         shape = (6 * graph.size(), 6 * values.size() + 1)
-        jacobian = csr_array((entry, (row.astype(np.int64) - 1, column.astype(np.int64) - 1)), shape=shape)
+        jacobian = scipy.sparse.csr_array((entry, (row.astype(np.int64) - 1, column.astype(np.int64) - 1)), shape=shape)
         m = 6 * len(self.loops)
         A, b = jacobian[:-m, :-1], jacobian[:-m, [-1]].toarray()
         J, r = jacobian[-m:, :-1], -jacobian[-m:, [-1]].toarray()
@@ -237,8 +237,8 @@ def _factor(edge: Edge) -> gtsam.NonlinearFactor:
 def _lowest(nodes: int, edges: Sequence[Edge]) -> list[int]:
     """For each node, the lowest of those that edges join it with."""
     ends = np.array([(edge.source, edge.target) for edge in edges], dtype=np.int64).reshape(-1, 2).T
-    joined = coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(nodes, nodes))
-    _, parts = connected_components(joined, directed=False)
+    joined = scipy.sparse.coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(nodes, nodes))
+    _, parts = scipy.sparse.csgraph.connected_components(joined, directed=False)
     _, first, part = np.unique(parts, return_index=True, return_inverse=True)
     return [int(node) for node in first[part]]
 

@@ -7,7 +7,7 @@ same weights: continuous, and blurred by about 0.6 of a cell.
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.sparse as sp
+import scipy  # its parts when they are used
 from jaxtyping import Float, Int
 
 Points = Float[np.ndarray, "_ 3"]
@@ -53,7 +53,7 @@ class Fields:
         """Pairs of submaps that have spread something to at least so many of the same corners, the earlier first."""
         filled = self._columns[0].copy()
         filled.data[:] = 1.0
-        shared = sp.triu(filled.T @ filled, k=1).tocoo()
+        shared = scipy.sparse.triu(filled.T @ filled, k=1).tocoo()
         return [(int(a), int(b)) for a, b, n in zip(shared.row, shared.col, shared.data, strict=True) if n >= fewest]
 
     def shared(self, a: int, b: int) -> tuple[Float[np.ndarray, "m c"], Float[np.ndarray, "m c"]]:
@@ -61,18 +61,18 @@ class Fields:
         _, in_a, in_b = np.intersect1d(self._filled[a], self._filled[b], assume_unique=True, return_indices=True)
         return self._sums[a][in_a], self._sums[b][in_b]
 
-    def _weights(self, points: Points) -> sp.csr_matrix:
+    def _weights(self, points: Points) -> "scipy.sparse.csr_matrix":
         """Points by corners."""
         keys, weights = _corners(points, self._cell)
         columns, starts = np.searchsorted(self._keys, keys), np.arange(0, keys.size + 1, len(_CORNERS))
-        return sp.csr_matrix((weights.ravel(), columns.ravel(), starts), shape=(len(points), len(self._keys)))
+        return scipy.sparse.csr_matrix((weights.ravel(), columns.ravel(), starts), shape=(len(points), len(self._keys)))
 
-    def _of_channel(self, channel: int) -> sp.csr_matrix:
+    def _of_channel(self, channel: int) -> "scipy.sparse.csr_matrix":
         """Corners by submaps."""
         rows = np.concatenate(self._filled)
         columns = np.repeat(np.arange(len(self)), [len(filled) for filled in self._filled])
         sums = np.concatenate([some[:, channel] for some in self._sums])
-        return sp.csr_matrix((sums, (rows, columns)), shape=(len(self._keys), len(self)))
+        return scipy.sparse.csr_matrix((sums, (rows, columns)), shape=(len(self._keys), len(self)))
 
 
 def _corners(points: Points, cell: float) -> tuple[Int[np.ndarray, "n 8"], Float[np.ndarray, "n 8"]]:
