@@ -298,7 +298,7 @@ def started(room: Path, out: Path) -> subprocess.Popen[str]:
     return process
 
 
-def test_a_killed_run_loses_no_sealed_submap(room_folder: Path, tmp_path: Path):
+def test_a_killed_run_loses_no_sealed_submap(room_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "killed"
     process = started(room_folder, out)
     process.kill()
@@ -310,7 +310,12 @@ def test_a_killed_run_loses_no_sealed_submap(room_folder: Path, tmp_path: Path):
     for index in range(run.submap_count):
         assert len(run.load_submap(index)) > 100
     assert main(["eval", str(out)]) == 0
-    assert "ms_per_frame" in json.loads((out / "report.json").read_text())["evaluated"]["missing"]
+    evaluated = json.loads((out / "report.json").read_text())["evaluated"]
+    assert "ms_per_frame" in evaluated["missing"]
+    part = f"only the first {len(run.trajectory()[0])} of {FRAMES} frames, since the run was killed"
+    assert evaluated["part"].startswith(part)
+    said = capsys.readouterr()
+    assert said.err.startswith(f"tcgsplat: warning: {out} holds {part}") and "--resume" in said.err
 
 
 def test_ctrl_c_saves_what_there_is(room_folder: Path, tmp_path: Path):

@@ -14,7 +14,7 @@ from tcgsplat.errors import EvaluationError
 from tcgsplat.evaluation import figures
 from tcgsplat.evaluation.accuracy import associate
 from tcgsplat.evaluation.lpips import Lpips
-from tcgsplat.evaluation.report import Metric, Report, evaluate, score_trajectory
+from tcgsplat.evaluation.report import Metric, Report, evaluate, score_trajectory, unfinished
 from tcgsplat.evaluation.views import spread
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
@@ -444,6 +444,21 @@ def test_killed_run_without_data_is_still_scored(run: RunDirectory, rasterizer: 
     assert "one keyframe in 2" in report.evaluated["training"]
     assert report.metrics["psnr_map"].value > 10.0
     assert "/data/wall" in report.evaluated["sequence"]
+    assert report.evaluated["part"].startswith("only the first 8 frames, since the run was killed, or ")
+
+
+def test_how_far_an_unfinished_run_has_come_is_told(run: RunDirectory, sequence: Recorded) -> None:
+    assert unfinished(run, sequence) is None
+    longer = replace(sequence, frames=sequence.frames * 2)
+    run.write_summary(run.summary() | {"interrupted": True})
+    told = unfinished(run, longer)
+    assert told is not None and told.startswith("only the first 8 of 16 frames, since the run was stopped ")
+    assert "--resume" in told
+    (run.path / "request.json").write_text('{"command": "tcgsplat run wall --realtime"}')
+    told = unfinished(run, longer)
+    assert told is not None and "--resume" not in told  # a live run cannot go on
+    run.write_summary(run.summary() | {"interrupted": False})
+    assert unfinished(run, longer) is None
 
 
 def test_run_that_sealed_nothing(tmp_path: Path, rasterizer: Rasterizer) -> None:

@@ -1,5 +1,6 @@
 """`tcgsplat eval`: how good a run is, in figures and pictures."""
 
+import logging
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,10 +9,14 @@ import tyro
 
 from tcgsplat.cli.usage import UsageError
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class Args:
-    """Score a run, finished or not: report.json, contact_sheet.png and trajectory.png go into its directory.
+    """Score a run: report.json, contact_sheet.png and trajectory.png go into its directory.
+
+    A run that was stopped or killed is scored as far as it came, and the report says how far that is.
 
     With --trajectory, score that file instead: the path of any system, in the TUM format, against the same data.
     """
@@ -42,7 +47,7 @@ class Args:
 def command(args: Args) -> int:
     """Print the report, and put it and the pictures into the run directory."""
     from tcgsplat.cli.scoring import data_of, scored, true_mesh_of
-    from tcgsplat.evaluation.report import score_trajectory
+    from tcgsplat.evaluation.report import score_trajectory, unfinished
     from tcgsplat.render.backends import open_rasterizer
     from tcgsplat.storage.run_directory import RunDirectory
 
@@ -60,6 +65,8 @@ def command(args: Args) -> int:
         return 0
     if run is None:
         raise UsageError("give a run directory, or --trajectory and --sequence")
+    if (part := unfinished(run, sequence)) is not None:
+        logger.warning("%s holds %s", run.path, part)
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     true_mesh = true_mesh_of(sequence, run, args.true_mesh) if args.surface or args.true_mesh else None
     report = scored(run, sequence, rasterizer, args.stride, args.withheld_every, args.lpips, true_mesh)

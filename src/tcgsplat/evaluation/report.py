@@ -36,7 +36,7 @@ from tcgsplat.storage.run_directory import RunDirectory
 from tcgsplat.storage.world_map import world_map
 from tcgsplat.tensors import Pose
 
-__all__ = ["Metric", "Report", "evaluate", "score_trajectory"]
+__all__ = ["Metric", "Report", "evaluate", "score_trajectory", "unfinished"]
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,8 @@ def evaluate(
       submaps), `gaussians_map` (of the one map), and from the run's summary `loops`, `ms_per_frame` and `peak_rss_mb`.
     - Of a run in real time, from its summary: `frames_dropped`, and `ms_late`, the median from a frame's capture to its
       pose.
+
+    What was evaluated begins with `part` if the run did not reach its end, as `unfinished` has it.
 
     Args:
         run: The run's directory.
@@ -128,6 +130,7 @@ def evaluate(
         **_cost(run.summary()),
     }
     evaluated = {
+        **({} if (part := unfinished(run, sequence)) is None else {"part": part}),
         "run": str(run.path),
         "sequence": sequence.name if sequence is not None else run.sequence,
         "trajectory": f"{scored} of {len(trajectory)} frames have a true pose; {ALIGNMENT}",
@@ -141,6 +144,28 @@ def evaluate(
         f"{MIN_COVERAGE:g}, whose share is coverage; depth_l1: those with a sensor reading, unmapped ones in full",
     }
     return Report.of(rows, evaluated)
+
+
+def unfinished(run: RunDirectory, sequence: Sequence | None) -> str | None:
+    """How far a run has come that did not reach the end of its frames, and how it goes on; None of one that did.
+
+    Args:
+        run: The run's directory.
+        sequence: The part of the data that the run was asked for; None if it is not at hand.
+
+    Raises:
+        ArchiveError: if a file of the run is damaged.
+    """
+    summary = run.summary()
+    if summary and not summary.get("interrupted"):
+        return None
+    rows = run.trajectory()[0].rows
+    frames = rows[-1].frame_index + 1 if rows else 0
+    whole = f" of {len(sequence)}" if sequence is not None else ""
+    why = "was stopped before its end" if summary else "was killed, or has not ended yet"
+    live = "--realtime" in str((run.request or {}).get("command"))
+    goes_on = "" if live else "; `tcgsplat run` with the same arguments and --resume goes on with it"
+    return f"only the first {frames}{whole} frames, since the run {why}{goes_on}"
 
 
 def _told_withheld(run: RunDirectory, trajectory: Trajectory, withheld: int, drawn: int) -> str:
