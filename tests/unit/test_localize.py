@@ -84,7 +84,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
 
 def localized(world: World, *arguments: str | Path, out: Path) -> dict[float, Pose]:
     """Poses by time stamp, as the file has them."""
-    assert main(["localize", str(world.run), *map(str, arguments), "--out", str(out)]) == 0
+    assert main(["localize", str(world.run), *map(str, arguments), "--out", str(out), "--overwrite"]) == 0
     stamps, poses = parse_tum(out.read_text())
     return dict(zip(stamps, poses, strict=True))
 
@@ -145,6 +145,18 @@ def test_poses_go_to_the_run_directory_unless_told_otherwise(world: World, tmp_p
     assert stamp == 0.0
     assert_near(T, world.truth(5))
     assert before == {file: file.read_bytes() for file in before}
+
+
+def test_poses_are_replaced_only_when_asked_to(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run = Path(shutil.copytree(world.run, tmp_path / "run"))
+    poses = run / "localized.txt"
+    poses.write_text("of another day")
+    assert main(["localize", str(run), str(world.color(5))]) == 2
+    told = f"tcgsplat: {poses} exists; choose another file by --out, or replace it by --overwrite\n"
+    assert capsys.readouterr().err == told
+    assert poses.read_text() == "of another day"
+    assert main(["localize", str(run), str(world.color(5)), "--overwrite"]) == 0
+    assert len(parse_tum(poses.read_text())[0]) == 1
 
 
 def test_a_picture_beside_a_sequence_does_not_hide_it(world: World, tmp_path: Path):

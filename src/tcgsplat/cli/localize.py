@@ -36,6 +36,8 @@ class Args:
     """Use no more than so many."""
     out: Path | None = None
     """File to write the poses to; localized.txt in the run directory if left out."""
+    overwrite: bool = False
+    """Replace the file if it is there."""
     backend: str = "auto"
     """Rasterizer: auto, numba, reference, cuda or gsplat."""
 
@@ -59,6 +61,8 @@ def command(args: Args) -> int:
     out = args.out or run.path / "localized.txt"
     if out.is_dir() or not out.parent.is_dir():
         raise UsageError(f"--out {out} cannot be written: give the name of a file, in a folder that is there")
+    if out.exists() and not args.overwrite:
+        raise UsageError(f"{out} exists; choose another file by --out, or replace it by --overwrite")
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     frames = frames_of(run, args.images, args.start, args.stride, args.limit)
     torch.set_num_threads(1)  # as in a run: the kernels have threads of their own
