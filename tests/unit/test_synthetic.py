@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from tcgsplat.cli.synth import warn_of_speed
 from tcgsplat.datasets.opening import open_sequence
-from tcgsplat.datasets.synthetic import SynthConfig, synthesize, twins
+from tcgsplat.datasets.synthetic import SynthConfig, greatest_step, synthesize, twins
 from tcgsplat.datasets.synthetic.lighting import Workspace
 from tcgsplat.datasets.synthetic.materials import palette
 from tcgsplat.datasets.synthetic.patterns import noise
@@ -213,6 +214,37 @@ def test_the_camera_moves_gently_and_comes_back(seed: int, frames: int, metres: 
         rotation @ rotation.transpose(0, 2, 1), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-12
     )
     assert (np.linalg.det(rotation) > 0).all()
+
+
+@pytest.mark.parametrize("rest", [0, 20])
+def test_its_greatest_step_is_known(rest: int) -> None:
+    config = SynthConfig(frames=60, fps=10, still=rest)
+    moved, turned = motion(camera_poses(config, np.arange(config.timetable.recorded) / 10))
+    assert greatest_step(config) == pytest.approx((moved.max(), turned.max()), rel=1e-6)
+    assert greatest_step(config).metres > 0.1
+
+
+@pytest.mark.parametrize(
+    ("config", "advice"),
+    [
+        (SynthConfig(), None),
+        (SynthConfig(frames=200), None),
+        (SynthConfig(place="twins"), None),
+        (SynthConfig(frames=60), "the camera moves by up to 19 cm and 14 degrees a frame, faster than"),
+        (SynthConfig(frames=60), "--frames 190 or more, and for a short run take the first "),
+        (SynthConfig(frames=3), "--frames 190 or more"),
+        (SynthConfig(frames=300, place="twins"), "--frames 410 or more"),
+    ],
+)  # fmt: skip
+def test_a_walk_too_fast_to_be_tracked_is_told(
+    config: SynthConfig, advice: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    warn_of_speed(config)
+    if advice is None:
+        assert caplog.messages == []
+    else:
+        (told,) = caplog.messages
+        assert advice in told
 
 
 def test_the_camera_visits_both_rooms_and_the_seed_shakes_it() -> None:

@@ -21,7 +21,7 @@ class Args:
     preset: str = "default"
     """Where the settings start from."""
     frames: int = 600
-    """Of the whole walk; with fewer of them the camera moves faster."""
+    """Of the whole walk; with fewer of them the camera moves faster, and below 200 tracking may get lost."""
     width: int = 320
     """Pixels across; the height is three quarters of it."""
     backend: str = "auto"
@@ -38,6 +38,7 @@ def command(args: Args) -> int:
     from tcgsplat.cli.recorder import Part, begin, recorded
     from tcgsplat.cli.scoring import scored
     from tcgsplat.cli.settings import resolved
+    from tcgsplat.cli.synth import warn_of_speed
     from tcgsplat.datasets.synthetic import SynthConfig, synthesize
     from tcgsplat.render.backends import open_rasterizer
     from tcgsplat.storage.ply import write_gaussians
@@ -46,10 +47,12 @@ def command(args: Args) -> int:
     config = resolved(args.preset, None, args.settings, None)
     rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
     make_way(args.out, overwrite=args.overwrite)
+    walk = SynthConfig(args.frames, args.width, 3 * args.width // 4)
+    warn_of_speed(walk)
     data = args.out / "sequence"
     say(f"making the apartment: {data}")
     with counting("frame") as progress:
-        synthesize(data, SynthConfig(args.frames, args.width, 3 * args.width // 4), progress)
+        synthesize(data, walk, progress)
     sequence = Part().open(data)
     run = begin(args.out / "run", config, data, Part(), overwrite=False)
     summary = recorded(sequence, config, rasterizer, run, args.preset)

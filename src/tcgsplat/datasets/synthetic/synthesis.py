@@ -35,7 +35,8 @@ class SynthConfig:
     """A walk through a furnished apartment of two rooms and back, as an RGB-D camera records it."""
 
     frames: int = 600
-    """Number of frames for the whole walk, but for a rest (`still`): with fewer, the camera moves faster."""
+    """Number of frames for the whole walk, but for a rest (`still`). With fewer the camera moves faster; below 200
+    (`twins`: 410) tracking may get lost. For a short run keep the walk, and take its beginning: `run --limit`."""
     width: int = 320
     """Width of the images, pixels."""
     height: int = 240
@@ -190,6 +191,21 @@ def camera_poses(config: SynthConfig, seconds: Array) -> Array:
     """The camera's exact poses `T_world_cam` [n, 4, 4] float64 at the given times [n] (seconds) of the recording."""
     walked = _walked(config, seconds)
     return way.camera_poses(PLACES[config.place].walk, _progress(config, walked), walked, config.seed)
+
+
+class Step(NamedTuple):
+    """How far the camera moves from one frame to the next."""
+
+    metres: float
+    degrees: float
+
+
+def greatest_step(config: SynthConfig) -> Step:
+    """The longest way and the widest turn between two frames, none of which got lost."""
+    T = camera_poses(config, np.arange(config.timetable.recorded) / config.fps)
+    moved = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    cosines = (np.einsum("nij,nij->n", T[:-1, :3, :3], T[1:, :3, :3]) - 1) / 2
+    return Step(float(moved.max()), float(np.degrees(np.arccos(np.clip(cosines, -1, 1))).max()))
 
 
 def _walked(config: SynthConfig, seconds: Array) -> Array:
