@@ -85,13 +85,12 @@ def _run(command: str, arguments: list[str], debug: bool) -> int:
 
 def _parsed(command: str, kind: Any, arguments: list[str]) -> Any:
     """The command's arguments; flags with a dot, such as `--mapper.iterations 20`, are settings."""
-    import tyro
+    from tcgsplat.cli.parsing import parsed
 
     own, flags = _split(arguments)
     if flags and "settings" not in kind.__dataclass_fields__:
         own += [f"--{path}" for path in flags]  # unknown to this command, and it will say so
-    style = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone, tyro.conf.PositionalMetavarFromFieldName)
-    args = tyro.cli(kind, prog=f"tcgsplat {command}", args=own, config=style)
+    args = parsed(kind, f"tcgsplat {command}", own)
     return replace(args, settings=flags) if flags else args
 
 

@@ -15,12 +15,12 @@ class Args:
     """Map a recorded RGB-D sequence; TUM RGB-D, Replica, ScanNet and plain folders are recognised by themselves.
 
     Every setting is a flag too, e.g. --mapper.iterations 20 --tracker.solver descent --confidence.guide-mapping false;
-    `tcgsplat presets default` lists them. A flag counts more than the file, the file more than the preset. Ctrl-C ends
-    the run after the current frame and saves what there is.
+    all are listed by `tcgsplat presets default`. A flag counts more than the file, the file more than the preset.
+    Ctrl-C ends the run after the current frame and saves what there is.
 
-    --realtime shows whether this machine keeps up with the camera. While a frame is worked on, newer ones replace
-    older ones; those replaced are counted, and missing in the trajectory. How many that are depends on how fast the
-    machine is at the moment, so the results of two such runs differ.
+    With --realtime you see whether this machine keeps up with the camera. While a frame is worked on, newer ones
+    replace older ones; those replaced are counted, and missing in the trajectory. How many that are depends on how fast
+    the machine is at the moment, so the results of two such runs differ.
     """
 
     folder: tyro.conf.Positional[Path]

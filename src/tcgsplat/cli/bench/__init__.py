@@ -32,10 +32,11 @@ class Render:
 class Track:
     """Time the whole system on a recorded sequence, at the size that its images have; nothing is written down.
 
-    `load` is waiting for the reader, which decodes the next frames beside; the stages are those of the system, by its
-    own names; `frame` is the whole of a frame: load, stages, and what is between them; `update` is a mapping update on
-    its own thread. The first frame and update are left out: caches are cold, and the whole first view is mapped.
-    Use `taskset -c 0,1 tcgsplat ...` to allow only some cores. Every setting is a flag, as for `tcgsplat run`.
+    In the table `load` is waiting for the reader, which decodes the next frames beside; the stages are those of the
+    system, by its own names; `frame` is the whole of a frame: load, stages, and what is between them; `update` is a
+    mapping update on its own thread. The first frame and update are left out: caches are cold, and the whole first view
+    is mapped. Use `taskset -c 0,1 tcgsplat ...` to allow only some cores. Every setting is a
+    flag, as for `tcgsplat run`.
     """
 
     folder: tyro.conf.Positional[Path]
@@ -120,7 +121,7 @@ class Gpu:
     sizes: tuple[str, ...] = ("640x480x150000", "640x480x600000", "1200x680x150000", "1200x680x600000")
     """Of the random scenes: width, height, Gaussians; none to leave them out."""
     bare: bool = True
-    """Beside them gsplat alone, if it is installed; it compiles when it is first used, some minutes."""
+    """Leave out gsplat alone, which is timed beside them if it is installed; it compiles for minutes at first."""
     repeats: int = 10
     """Timed runs of each contender on each scene."""
     steps: int = 60
@@ -143,9 +144,9 @@ class Gpu:
 class Confidence:
     """See whether confidence is true: what the map claims of a frame before it has seen it, against the true depth.
 
-    Every sequence is gone through twice, with our model of confidence and with the paper's. Sequences need a folder
-    `truth`, as `tcgsplat synth` makes it. A page with tables and plots, and all figures, go to OUT. Every setting is a
-    flag, as for `tcgsplat run`.
+    Every sequence is gone through twice, with our model of confidence and with the paper's. Sequences need a
+    folder `truth`, as `tcgsplat synth` makes it. A page with tables and plots, and all figures, go to OUT. Every
+    setting is a flag, as for `tcgsplat run`.
     """
 
     folders: tyro.conf.Positional[tuple[Path, ...]]
@@ -220,8 +221,8 @@ class Recorded(SuiteArgs):
 
 @dataclass(frozen=True, kw_only=True)
 class Tum(Recorded):
-    """Run the five sequences of the paper's Table 3: DATA/rgbd_dataset_freiburg1_desk, ...1_desk2, ...1_room,
-    ...2_xyz and ...3_long_office_household. Those that are not there are named and left out. As `bench synthetic`.
+    """Run the five sequences of the paper's Table 3: DATA/rgbd_dataset_freiburg1_desk, ...1_desk2, ...1_room, ...2_xyz
+    and ...3_long_office_household. Those that are not there are named and left out. As `bench synthetic`.
     """
 
 
