@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from matplotlib import colormaps
 
 from tcgsplat.evaluation import canvas, figures
 
@@ -69,6 +70,24 @@ def test_trajectory_plot_with_and_without_truth() -> None:
     partial[:60] = np.nan
     assert figures.trajectory_plot(times, estimated, partial).shape == whole.shape
     assert figures.trajectory_plot(times, estimated, np.full_like(truth, np.nan)).shape == without.shape
+
+
+def test_a_legend_names_the_lines_of_the_trajectory_plot_and_lost_frames_are_marked() -> None:
+    times, estimated, truth = paths()
+    whole = figures.trajectory_plot(times, estimated, truth, switches=[30])
+    broken = figures.trajectory_plot(times, estimated, truth, switches=[30], lost=range(80, 100))
+
+    def crimson(picture: np.ndarray) -> np.ndarray:
+        return np.abs(picture.astype(int) - [220, 20, 60]).max(axis=2) < 40
+
+    legend = slice(46, 66)
+    estimated_line = np.array(colormaps["plasma"](0.35 * 0.88)[:3]) * 255
+    for picture in (whole, broken, figures.trajectory_plot(times, estimated)):
+        assert (np.abs(picture[legend] - estimated_line).max(axis=2) < 30).sum() > 20
+    assert not crimson(whole).any()
+    assert crimson(broken[legend]).any(), "named"
+    assert crimson(broken[100:-300]).sum() > 5 * crimson(broken[legend]).sum(), "on the path"
+    assert crimson(broken[-90:]).sum() > 5 * crimson(broken[legend]).sum(), "and below its error"
 
 
 def test_trajectory_plot_is_aligned_to_the_truth() -> None:

@@ -37,6 +37,8 @@ from tcgsplat.tensors import Image, Plane
 
 _NO_DEPTH = 222
 """Grey level of a pixel that has no depth."""
+_LOST = "crimson"
+"""Colour of frames in which tracking was lost."""
 _TALLEST = 620
 """Pixels that the panels of a path may be high."""
 
@@ -133,6 +135,7 @@ def trajectory_plot(
     truth: ate.Positions | None = None,
     *,
     switches: Sequence[int] = (),
+    lost: Sequence[int] = (),
     width: int = 1200,
 ) -> Picture:
     """The path from two sides, coloured by its error, or by time where there is no truth (the paper's Fig. 2).
@@ -145,6 +148,7 @@ def trajectory_plot(
         estimated: Camera centres, metres.
         truth: True centres, metres, NaN where unknown. The estimate is aligned to them (rigid, no scale).
         switches: Rows with which a new submap begins.
+        lost: Rows of frames in which tracking was lost.
         width: Pixels across the picture.
     """
     path = _aligned_path(times, estimated, truth)
@@ -155,25 +159,27 @@ def trajectory_plot(
     aside = int(spread.argmin())
     across, up = (axis for axis in range(3) if axis != aside)
 
-    left, between, right, top, bottom, strip = 80, 84, 120, 56, 62, 130
+    left, between, right, top, bottom, labels, strip = 80, 84, 120, 84, 62, 16, 130
     room = width - left - between - right
     scale = min(float(room / (span[across] + span[aside])), _TALLEST / float(span[up]))  # pixels a metre
     height = round(scale * float(span[up]))
     below = top + height + bottom
-    figure = canvas.blank(width, below + (strip + bottom if path.known.any() else 0))
+    figure = canvas.blank(width, below + (labels + strip + bottom if path.known.any() else 0))
     x = left + (room - scale * float(span[across] + span[aside])) / 2
     for axis in (across, aside):
         panel = canvas.axes(figure, x, top, scale * float(span[axis]), height)
         for name, i in (("x", axis), ("y", up)):
             middle, half = (low[i] + high[i]) / 2, span[i] / 2
             panel.set(**{f"{name}lim": (middle - half, middle + half), f"{name}label": f"{'xyz'[i]} [m]"})
-        _draw_path(panel, path, (axis, up), switches)
+        _draw_path(panel, path, (axis, up), switches, lost)
         x += scale * float(span[axis]) + between
     canvas.color_bar(canvas.axes(figure, x - between + 22, top, 14, height), path.colors, path.unit)
-    canvas.write(figure, left, top / 2, path.title, size=13, align="left")
-    canvas.legend(figure, panel, width - 10, top / 2)
+    canvas.write(figure, left, top / 3, path.title, size=13, align="left")
+    canvas.legend(figure, panel, width - 10, 2 * top / 3)
     if path.known.any():
-        _draw_error(canvas.axes(figure, left, below, width - left - right, strip), path, switches)
+        panel = canvas.axes(figure, left, below + labels, width - left - right, strip)
+        _draw_error(panel, path, switches, lost)
+        canvas.legend(figure, panel, width - right, below + labels / 4)
     return canvas.drawn(figure)
 
 
@@ -199,6 +205,7 @@ def trajectory_plot_of(run: RunDirectory, sequence: RgbdSequence | None, *, widt
         ate.positions(trajectory.world(atlas)),
         truth,
         switches=[i for i in range(1, len(rows)) if rows[i].submap_index != rows[i - 1].submap_index],
+        lost=[i for i, row in enumerate(rows) if row.lost],
         width=width,
     )
 
@@ -245,6 +252,11 @@ class _Path:
         return "cm" if self.known.any() else "s"
 
     @property
+    def color(self) -> tuple[float, float, float, float]:
+        """That stands for all of them."""
+        return self.colors.cmap(0.35)
+
+    @property
     def colors(self) -> ScalarMappable:
         """From 0 to the greatest value, without the map's pale end, to be seen on white; dark grey where unknown."""
         shades = ListedColormap(colormaps["plasma"](np.linspace(0.0, 0.88, 256))).with_extremes(bad="0.4")
@@ -259,7 +271,7 @@ def _aligned_path(times: Float[np.ndarray, " n"], estimated: ate.Positions, trut
     return _Path(times, estimated, np.full_like(estimated, np.nan))
 
 
-def _draw_path(panel: Axes, path: _Path, axes: tuple[int, int], switches: Sequence[int]) -> None:
+def _draw_path(panel: Axes, path: _Path, axes: tuple[int, int], switches: Sequence[int], lost: Sequence[int]) -> None:
     """Two coordinates against each other: the truth in grey below, the estimate in colour above it."""
     estimated, truth = path.estimated[:, axes], path.truth[:, axes]
     _style(panel)
@@ -269,6 +281,10 @@ def _draw_path(panel: Axes, path: _Path, axes: tuple[int, int], switches: Sequen
     line = LineCollection(list(segments), cmap=path.colors.cmap, norm=path.colors.norm, linewidth=1.8, capstyle="round")
     line.set_array(np.ma.masked_invalid(path.value[1:]))
     panel.add_collection(line, autolim=False)
+    what = "its error" if path.known.any() else "time"
+    panel.plot((), (), color=path.color, linewidth=1.8, label=f"estimated, coloured by {what}")
+    if lost:
+        panel.plot(*estimated[list(lost)].T, "x", color=_LOST, markersize=6, label="tracking lost", zorder=3)
     if switches:
         _draw_marks(panel, estimated[list(switches)], "D", 5, "white", "new submap")
     _draw_marks(panel, estimated[:1], "o", 10, "limegreen", "start")
@@ -278,14 +294,20 @@ def _draw_marks(panel: Axes, points: Float[np.ndarray, "k 2"], shape: str, size:
     panel.plot(*points.T, shape, markersize=size, markerfacecolor=fill, markeredgecolor="black", label=label, zorder=3)
 
 
-def _draw_error(panel: Axes, path: _Path, switches: Sequence[int]) -> None:
-    """Error over time, with the times at which submaps begin."""
+def _draw_error(panel: Axes, path: _Path, switches: Sequence[int], lost: Sequence[int]) -> None:
+    """Error over time, with the times at which submaps begin and those at which tracking was lost."""
     _style(panel)
-    for i in switches:
-        panel.axvline(path.times[i], color="0.75", linewidth=1)
-    panel.fill_between(path.times, path.error, color=path.colors.cmap(0.35), alpha=0.25, linewidth=0)
-    panel.plot(path.times, path.error, color=path.colors.cmap(0.35), linewidth=1.4)
-    panel.axhline(path.rmse, color=canvas.INK, linewidth=1, linestyle="--")
+    panel.fill_between(path.times, path.error, color=path.color, alpha=0.25, linewidth=0)
+    panel.plot(path.times, path.error, color=path.color, linewidth=1.4, label="error of the position")
+    panel.axhline(path.rmse, color=canvas.INK, linewidth=1, linestyle="--", label="RMSE")
+    above = panel.get_xaxis_transform()
+    if lost:
+        panel.plot(
+            path.times[list(lost)], np.zeros(len(lost)), "x", color=_LOST, markersize=6, label="tracking lost",
+            transform=above, clip_on=False,
+        )  # fmt: skip
+    if switches:
+        panel.vlines(path.times[list(switches)], 0, 1, color="0.75", linewidth=1, label="new submap", transform=above)
     panel.set(xlim=(path.times[0], path.times[-1]), xlabel="time [s]", ylabel="error [cm]")
     panel.set_ylim(bottom=0)
 
