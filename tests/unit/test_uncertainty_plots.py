@@ -127,9 +127,16 @@ def test_forest_of_a_single_pair_has_no_interval() -> None:
     values: dict[Run, float] = {("off", "a", 0): 1.0, ("ours", "a", 0): 1.5}
     figure = plots.forest_plot(paired_differences(values, "off"), measure="PSNR", unit="dB", better="higher")
     canvas.drawn(figure)
-    assert "? … ?" in texts(figure)
+    written = texts(figure)
+    assert {"+0.500", "none of one pair", "none", "1"} <= set(written) and not any("?" in text for text in written)
     with pytest.raises(EvaluationError, match="no difference to draw"):
         plots.forest_plot([], measure="PSNR")
+
+
+def test_forest_of_equal_runs_has_an_interval_and_no_test() -> None:
+    values: dict[Run, float] = {(arm, "a", seed): 1.0 for arm in ("off", "ours") for seed in (0, 1)}
+    written = texts(plots.forest_plot(paired_differences(values, "off"), measure="PSNR", unit="dB", better="higher"))
+    assert {"+0 … +0", "none", "2"} <= set(written) and "none of one pair" not in written
 
 
 def test_fault_is_shaded_and_its_reaction_marked() -> None:

@@ -189,7 +189,7 @@ def forest_plot(
     """Difference of each arm to the reference: mean, interval, and the sequences as small dots.
 
     An interval without 0 in it is drawn in blue where the arm is better and in vermilion where it is worse; others are
-    grey.
+    grey. Of a single pair there is neither an interval nor a test, and that is what the figure says.
 
     Args:
         differences: One or more, of one reference and level; the p shown is that of pairs.
@@ -223,8 +223,9 @@ def forest_plot(
         panel.plot(mean, i, "D", color=color, markersize=9)
         y = top + row * (i + 0.5)
         canvas.write(figure, left - 14, y, one.arm, size=_TEXT, align="right")
-        numbers = [_signed(value, decimals) for value in (mean, low, high)]
-        cells = (numbers[0], f"{numbers[1]} … {numbers[2]}", _p(one.p_of_pairs), str(one.pairs))
+        ends = " … ".join(_signed(value, decimals) for value in (low, high))
+        interval = "none of one pair" if one.pairs == 1 else ends
+        cells = (_signed(mean, decimals), interval, _p(one.p_of_pairs) if one.pairs > 1 else "none", str(one.pairs))
         for x, text in zip(columns, cells, strict=True):
             canvas.write(figure, x, y, text, size=_TEXT, align="right")
     panel.set_ylim(len(differences) - 0.5, -0.5)
@@ -354,7 +355,7 @@ def _signed(value: float, decimals: int) -> str:
 
 def _p(value: float) -> str:
     if math.isnan(value):
-        return "?"
+        return "none"
     return "< 0.001" if value < 0.001 else f"{value:.3f}"
 
 
