@@ -11,11 +11,11 @@ import numpy as np
 
 from tcgsplat.mapping.adam import BETA_1, BETA_2, EPSILON
 from tcgsplat.render.conventions import MAX_OPACITY
-from tcgsplat.render.numba_cpu import blending, projection
+from tcgsplat.render.numba_cpu import projection
 from tcgsplat.render.numba_cpu.compilation import inner, kernel
 from tcgsplat.render.numba_cpu.lanes import load, load_rows, mask_ge, store, store_rows
 from tcgsplat.render.numba_cpu.layout import FEATURE, LOG2_OPACITY, MEAN, PARAMETERS, QUAT, SCALE
-from tcgsplat.render.numba_cpu.pass_kernels import TILES
+from tcgsplat.render.numba_cpu.pass_kernels import ONLY_PHASE
 from tcgsplat.render.numba_cpu.phases import BEGIN, DONE, WAITING, next_unit
 from tcgsplat.render.numba_cpu.simd import (
     Vector,
@@ -42,8 +42,6 @@ ROWS = SH + 3
 SCALE_WEIGHT, ROTATION_WEIGHT, STABILITY_WEIGHT = ROWS, ROWS + 1, ROWS + 2
 CONSTANTS = ROWS + 3
 
-BACKWARD, STEP = 0, 1
-"""Phases of `step`."""
 UNIT = 512
 """Gaussians that a thread takes at a time: their derivatives stay in the nearest cache."""
 
@@ -220,36 +218,24 @@ def _adam_step(start, stop, raw, P, before, first, second, clocks, grads, depths
         activate(raw, P, i, i + 16)
 
 
-@kernel("i8[::1], i8, i4[::1], i8[::1], f4[::1], i8, i8, i8, f4[::1], i4[::1], f4[::1], f4[::1], f4[::1], f4[::1], u4[::1], f4[::1], f4[::1], f4[::1], i8, f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1]")
+@kernel("i8[::1], f4[::1], u4[::1], f4[::1], f4[::1], f4[::1], i8, f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1]")
 def step(
-    progress, last_phase, tile_ends, pairs, records, tiles_x, width, height, grid, masks, planes, d_planes, local,
-    pair_sums, slot_starts, cam, grads, pose, n, raw, P, before, first, second, clocks, depths, allowed, scale,
+    progress, pair_sums, slot_starts, cam, grads, pose, n, raw, P, before, first, second, clocks, depths, allowed, scale,
     constants, excess,
 ):
-    """From `d_planes` to the next parameters of all Gaussians. False: has waited for long.
+    """From the sums of all pairs to the next parameters of all Gaussians. False: has waited for long.
 
-    The arguments up to `local` are those of `blending.backward`, from `slot_starts` to `pose` of `projection.backward`,
-    the others of `_adam_step`. Derivatives by parameters live from the one to the other in `grads`, a worker's own for
-    one unit: to write them all to memory and to read them again would take longer than either. The pose stays.
+    The arguments up to `pose` are those of `projection.backward`, the others of `_adam_step`. Derivatives by
+    parameters live from the one to the other in `grads`, a worker's own for one unit: to write them all to memory and
+    to read them again would take longer than either. The pose stays.
     """
-    tiles = tile_ends.size - 1
-    for phase in range(last_phase + 1):
-        count = -(-tiles // TILES) if phase == BACKWARD else -(-n // UNIT)
-        k = next_unit(progress, phase, count, BEGIN)
-        while k >= 0:
-            if phase == BACKWARD:
-                blending.backward(
-                    k * TILES, min((k + 1) * TILES, tiles), tile_ends, pairs, records, tiles_x, width, height, grid,
-                    masks, planes, d_planes, local, pair_sums,
-                )
-            else:
-                start, stop = k * UNIT, min((k + 1) * UNIT, n)
-                projection.backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, start, pose)
-                _adam_step(
-                    start, stop, raw, P, before, first, second, clocks, grads, depths, allowed, scale, constants,
-                    excess,
-                )
-            k = next_unit(progress, phase, count, DONE)
-        if k == WAITING:
-            return False
-    return True
+    units = -(-n // UNIT)
+    k = next_unit(progress, ONLY_PHASE, units, BEGIN)
+    while k >= 0:
+        start, stop = k * UNIT, min((k + 1) * UNIT, n)
+        projection.backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, start, pose)
+        _adam_step(
+            start, stop, raw, P, before, first, second, clocks, grads, depths, allowed, scale, constants, excess
+        )
+        k = next_unit(progress, ONLY_PHASE, units, DONE)
+    return k != WAITING

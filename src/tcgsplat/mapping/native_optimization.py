@@ -225,21 +225,18 @@ def stepped(passes: Passes, space: Workspace, drawn: Drawn, d_planes: Floats, ra
 
     `adam` is what the kernel takes from `before` on, but for the depths, which the drawing has.
     """
-    blending, pair_sums = passes.blending_backward(drawn, d_planes)
-    threads = passes.workers.threads
+    pair_sums, threads = passes.pair_sums(drawn, d_planes), passes.workers.threads
     grads, pose = space.floats("grads", threads, kernels.UNIT * PARAMETERS), space.floats("pose", threads, POSE_SUMS)
     before, first, second, clocks, *rows = (_flat(array) for array in adam)
     shared = (
         drawn.padded, _flat(raw), drawn.parameters, before, first, second, clocks, drawn.depths, *rows
     )  # fmt: skip
-    passes.run(
+    passes.stage(
+        "step",
         kernels.step,
-        {"backward": kernels.BACKWARD, "step": kernels.STEP},
-        lambda worker: (
-            *blending(worker), pair_sums, drawn.slot_starts, drawn.camera_vector, grads[worker], pose[worker], *shared,
-        ),
+        lambda worker: (pair_sums, drawn.slot_starts, drawn.camera_vector, grads[worker], pose[worker], *shared),
         drawn.workspace,
-    )  # fmt: skip
+    )
 
 
 def _flat(array: Floats) -> Floats:

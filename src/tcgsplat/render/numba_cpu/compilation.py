@@ -10,6 +10,7 @@ import hashlib
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -29,6 +30,9 @@ _OPTIONS: Final[dict[str, Any]] = {
     "nogil": True,
     "no_cfunc_wrapper": True,
 }
+
+_MOST_PROCESSES: Final = 4
+"""With more, all but one would wait for the kernel that takes longest."""
 
 inner: Final = njit(**_OPTIONS | {"no_cpython_wrapper": True})
 """Of functions that only kernels call and are kept with: without a way in from elsewhere and without machine code of
@@ -111,8 +115,8 @@ def compile_missing(kernels: Sequence[Kernel], processes: int) -> None:
     Numba has one lock around its compiler, so threads would wait for each other. What another process could not do,
     for whatever reason, is left to this one's first call.
     """
-    left = iter(kernels)
-    helpers = [Thread(target=_compile_elsewhere, args=(left,)) for _ in range(min(processes, len(kernels)) - 1)]
+    left, helping = iter(kernels), min(processes, len(kernels), _MOST_PROCESSES) - 1
+    helpers = [Thread(target=_compile_elsewhere, args=(left,), daemon=True) for _ in range(helping)]
     for helper in helpers:
         helper.start()
     for kernel in left:
@@ -124,15 +128,11 @@ def compile_missing(kernels: Sequence[Kernel], processes: int) -> None:
 def _compile_elsewhere(kernels: Iterator[Kernel]) -> None:
     """Have another process compile one kernel after the other, until none is left or it fails."""
     command = [sys.executable, "-c", f"import {__name__} as compilation; compilation.compile_as_told()"]
-    with Popen(command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, text=True) as other:
+    with suppress(OSError), Popen(command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL, text=True, bufsize=1) as other:
         assert other.stdin is not None
         assert other.stdout is not None
         for kernel in kernels:
-            try:
-                other.stdin.write(f"{kernel.module} {kernel.name}\n")
-                other.stdin.flush()
-            except BrokenPipeError:
-                return
+            other.stdin.write(f"{kernel.module} {kernel.name}\n")
             if not other.stdout.readline():
                 return
 

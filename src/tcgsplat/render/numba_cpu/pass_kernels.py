@@ -1,4 +1,4 @@
-"""The forward pass as two kernels, each of several phases that threads share; see `phases.py`.
+"""The passes as kernels of phases that threads share, see `phases.py`: two forward, two back.
 
 Between `arrange` and `composite` Python makes room for as many (splat, tile) pairs as there are.
 """
@@ -24,6 +24,9 @@ COUNT_TILES = LIST + 3 * DIGITS
 PLACE_TILES = COUNT_TILES + 1
 # Phases of `composite`.
 FILL, FORWARD = 0, 1
+ONLY_PHASE = np.int64(0)
+
+_WHOLE = np.int64(0)  # `grads` begin with the first splat
 
 
 @inner
@@ -123,3 +126,32 @@ def composite(
         if k == WAITING:
             return False
     return True
+
+
+@kernel("i8[::1], i4[::1], i8[::1], f4[::1], i8, i8, i8, f4[::1], i4[::1], f4[::1], f4[::1], f4[::1], f4[::1]")
+def differentiate(
+    progress, tile_ends, pairs, records, tiles_x, width, height, grid, masks, planes, d_planes, local, pair_sums
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """From `d_planes` to the sums of all pairs. False: has waited for long."""
+    tiles = tile_ends.size - 1
+    units = -(-tiles // TILES)
+    k = next_unit(progress, ONLY_PHASE, units, BEGIN)
+    while k >= 0:
+        blending.backward(
+            k * TILES, min((k + 1) * TILES, tiles), tile_ends, pairs, records, tiles_x, width, height, grid, masks,
+            planes, d_planes, local, pair_sums,
+        )  # fmt: skip
+        k = next_unit(progress, ONLY_PHASE, units, DONE)
+    return k != WAITING
+
+
+@kernel("i8[::1], f4[::1], f4[::1], i8, f4[::1], u4[::1], f4[::1], f4[:, ::1]")
+def chain(progress, pair_sums, P, n, cam, slot_starts, grads, pose_sums):  # type: ignore[no-untyped-def]
+    """From the sums of all pairs to `grads` and to each unit's `pose_sums`. False: has waited for long."""
+    k = next_unit(progress, ONLY_PHASE, pose_sums.shape[0], BEGIN)
+    while k >= 0:
+        projection.backward(
+            P, n, k * UNIT, min((k + 1) * UNIT, n), cam, slot_starts, pair_sums, grads, _WHOLE, pose_sums[k]
+        )
+        k = next_unit(progress, ONLY_PHASE, pose_sums.shape[0], DONE)
+    return k != WAITING

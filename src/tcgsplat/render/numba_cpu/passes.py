@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.conventions import JACOBIAN_MARGIN
-from tcgsplat.render.numba_cpu import gradient_kernels, projection, tiling
 from tcgsplat.render.numba_cpu import pass_kernels as kernels
+from tcgsplat.render.numba_cpu import projection, tiling
 from tcgsplat.render.numba_cpu.blending import BACKWARD_FLOATS
 from tcgsplat.render.numba_cpu.layout import (
     CAMERA,
@@ -160,7 +160,7 @@ class Passes:
             entries, space.longs("swapped", padded), space.counts("digit_counts", strips, tiling.DIGIT_VALUES),
             space.ints("digit_ends", tiling.DIGIT_VALUES + 1), tile_counts, tile_ends,
         )  # fmt: skip
-        self.run(
+        self._run(
             kernels.arrange,
             {"project": kernels.PROJECT, "sort": kernels.COUNT_TILES - 1, "": kernels.PLACE_TILES},
             lambda _: arranging,
@@ -179,7 +179,7 @@ class Passes:
             self._grid,
         )  # fmt: skip
         drawing = planes.reshape(-1)
-        self.run(
+        self._run(
             kernels.composite,
             {"bin": kernels.FILL, "forward": kernels.FORWARD},
             lambda worker: (*compositing, local[worker], lists[worker], masks, drawing),
@@ -197,33 +197,37 @@ class Passes:
         `grads` is where to write the former; a new array if left out.
         """
         space, padded = drawn.workspace, drawn.padded
-        blending, pair_sums = self.blending_backward(drawn, d_planes)
+        pair_sums = self.pair_sums(drawn, d_planes)
         pose_sums = space.floats("pose_sums", -(-padded // kernels.UNIT), projection.POSE_SUMS)
         out: Floats = aligned((padded // 16, PARAMETERS, 16)) if grads is None else grads  # type: ignore[assignment]
         chaining = (
             pair_sums, drawn.parameters, padded, drawn.camera_vector, drawn.slot_starts, out.reshape(-1), pose_sums,
         )  # fmt: skip
-        self.run(
-            gradient_kernels.differentiate,
-            {"backward": gradient_kernels.BACKWARD, "chain": gradient_kernels.CHAIN},
-            lambda worker: (*blending(worker), *chaining),
-            space,
-        )
+        self.stage("chain", kernels.chain, lambda _: chaining, space)
         pose = pose_sums.sum(axis=0, dtype=np.float64)
         d_T = np.zeros((4, 4))
         d_T[:3, :3], d_T[:3, 3] = pose[:9].reshape(3, 3), pose[9:]
         return out, d_T
 
-    def blending_backward(self, drawn: Drawn, d_planes: Floats) -> tuple[Callable[[int], Arguments], Floats]:
-        """What `blending.backward` takes between tiles and sums, for each worker, and the sums that it leaves."""
+    def pair_sums(self, drawn: Drawn, d_planes: Floats) -> Floats:
+        """What `blending.backward` leaves of the loss's derivative by the planes: a row for each pair's slot."""
         space, (_, height, width) = drawn.workspace, d_planes.shape
         pair_sums = space.floats("pair_sums", max(drawn.masks.size, 1) * RECORD)
         local = space.floats("local", self.workers.threads, BACKWARD_FLOATS)
-        shared = (
+        blending = (
             drawn.tile_ends, drawn.pairs, drawn.records, drawn.tiles_x, width, height, self._grid, drawn.masks,
             drawn.planes.reshape(-1), d_planes.reshape(-1),
         )  # fmt: skip
-        return lambda worker: (*shared, local[worker]), pair_sums
+        self.stage("backward", kernels.differentiate, lambda worker: (*blending, local[worker], pair_sums), space)
+        return pair_sums
+
+    def stage(
+        self, name: str, kernel: Callable[..., bool], arguments: Callable[[int], Arguments], space: Workspace
+    ) -> None:
+        """A kernel of one phase on all threads, each with its own arguments; one stage for `lap`."""
+        self.workers.share(partial(kernel, space.progress(1)), arguments)
+        if self._lap:
+            self._lap(name)
 
     def _workspace(self) -> Workspace:
         try:
@@ -231,21 +235,14 @@ class Passes:
         except IndexError:
             return Workspace()
 
-    def run(
+    def _run(
         self,
         kernel: Callable[..., bool],
         stages: dict[str, int],
         arguments: Callable[[int], Arguments],
         space: Workspace,
     ) -> None:
-        """A kernel on all threads, in one go; for `lap` stage by stage.
-
-        Args:
-            kernel: Takes its progress (see `phases.py`), the last phase that it is to do, and a worker's arguments.
-            stages: The last phase of each.
-            arguments: A worker's.
-            space: Where its progress is noted down.
-        """
+        """A kernel on all threads, in one go; for `lap` stage by stage, which are given with their last phases."""
         progress = space.progress(max(stages.values()) + 1)
         for stage, last_phase in stages.items() if self._lap else [("", max(stages.values()))]:
             self.workers.share(partial(kernel, progress, last_phase), arguments)
