@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tcgsplat.cli.kernels import MODULES
+from tcgsplat.cli.ahead import MODULES
 from tcgsplat.render.numba_cpu import compilation
 
 ONE_KERNEL = """
@@ -65,10 +65,11 @@ def test_every_source_counts(source: str, tmp_path: Path, monkeypatch: pytest.Mo
 
 RUN = """
 import json
-from tcgsplat.cli.kernels import MODULES, compile_kernels
+from tcgsplat.cli.ahead import MODULES
+from tcgsplat.cli.kernels import compile_kernels
 from tcgsplat.config import SlamConfig
 from tcgsplat.render.backends import open_rasterizer
-from tcgsplat.cli.kernels import MODULES
+from tcgsplat.cli.ahead import MODULES
 from tcgsplat.render.numba_cpu import compilation
 
 kernels = compilation.kernels_of(MODULES)
@@ -113,7 +114,7 @@ def test_processes_compile_side_by_side_and_one_may_die(fails: bool, tmp_path: P
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
     source = (
         "from tcgsplat.render.numba_cpu import compilation as c; k = c.kernels_of(['some_kernels']);"
-        "c.compile_missing(k, 3); before = [x.kept for x in k];"
+        "w = c.compiled(k, 3); w.__enter__(); w.__exit__(None, None, None); before = [x.kept for x in k];"
         "print(all(before), k[0].dispatcher(2), k[1].dispatcher(2.0), [x.kept for x in k])"
     )
     command = [sys.executable, "-c", source, "main"]

@@ -34,7 +34,8 @@ class Args:
 
 def command(args: Args) -> int:
     """All of it, ending with a few lines on how it went and where everything is."""
-    from tcgsplat.cli.progress import counting, say
+    from tcgsplat.cli.logs import say
+    from tcgsplat.cli.progress import counting
     from tcgsplat.cli.recorder import Part, begin, recorded
     from tcgsplat.cli.scoring import scored
     from tcgsplat.cli.settings import resolved

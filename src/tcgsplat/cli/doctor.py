@@ -44,7 +44,7 @@ def command(args: Args) -> int:  # noqa: ARG001
 def numba_finding() -> Finding:
     """The CPU backend; its kernels also work where a GPU draws, on what is done once a frame."""
     try:
-        from tcgsplat.cli.kernels import MODULES
+        from tcgsplat.cli.ahead import MODULES
         from tcgsplat.render.numba_cpu.compilation import kernels_of
 
         kernels = kernels_of(MODULES)

@@ -1,6 +1,5 @@
 """Getting the CPU kernels compiled before the clock starts, and saying so when that takes long."""
 
-import gc
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,27 +9,17 @@ from typing import Final
 import torch
 from numba.core import event
 
-from tcgsplat.cli.progress import say
+from tcgsplat.cli.ahead import ANNOUNCEMENT, missing_kernels
+from tcgsplat.cli.logs import say
 from tcgsplat.config import SlamConfig, with_settings
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.render.numba_cpu.compilation import compile_missing, kernels_of
+from tcgsplat.render.numba_cpu.compilation import compiled
 from tcgsplat.render.numba_cpu.workers import available_cores
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.frame import Frame
 from tcgsplat.slam import Slam
 from tcgsplat.tracking.synchronization import synchronized
 
-MODULES: Final = (
-    "tcgsplat.render.numba_cpu.pass_kernels",
-    "tcgsplat.mapping.loss_kernels",
-    "tcgsplat.mapping.native_kernels",
-    "tcgsplat.tracking.alignment_kernels",
-    "tcgsplat.mapping.seeding_kernels",
-    "tcgsplat.tracking.synchronization_kernels",
-    "tcgsplat.tracking.smoothing_kernels",
-)
-"""What a run on the CPU draws on; what takes long to compile first, so that processes finish together."""
-ANNOUNCEMENT: Final = "compiling kernels, once per machine: some seconds"
 _ONE_STEP: Final = {
     "tracker.descent.iterations": 1,
     "mapper.iterations": 1,
@@ -52,9 +41,10 @@ def compile_kernels(config: SlamConfig, rasterizer: Rasterizer) -> float:
         Seconds that it took: a fraction of one where the kernels are on disk.
     """
     started = time.perf_counter()
-    with _heard_compiling(partial(say, ANNOUNCEMENT)), _uncollected():
+    with _heard_compiling(partial(say, ANNOUNCEMENT)):
         if rasterizer.name == "numba":
-            compile_missing([kernel for kernel in kernels_of(MODULES) if not kernel.kept], available_cores())
+            with compiled(missing_kernels(), available_cores()):
+                pass
         slam = Slam(with_settings(config, _ONE_STEP), rasterizer)
         for index in range(2):
             slam.step(_wall(index))
@@ -103,15 +93,3 @@ def _heard_compiling(announce: Callable[[], object]) -> Iterator[None]:
         yield
     finally:
         event.unregister("numba:compile", listener)  # type: ignore[no-untyped-call]
-
-
-@contextmanager
-def _uncollected() -> Iterator[None]:
-    """Without the collector of garbage: it looks at every object of torch's again while the compiler makes more."""
-    collecting = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collecting:
-            gc.enable()

@@ -1,4 +1,4 @@
-"""What the library logs, on the terminal: a few lines of each kind, then only their number."""
+"""What a person reads on the terminal beside results: what commands say, and what the library logs."""
 
 import logging
 import sys
@@ -8,6 +8,12 @@ from contextlib import contextmanager
 
 SHOWN = 5
 """Warnings of one kind that are shown in full."""
+
+
+def say(sentence: str) -> None:
+    """A line to a person who watches: on standard error if that is a terminal, else nowhere."""
+    if sys.stderr.isatty():
+        sys.stderr.write(f"{sentence}\n")
 
 
 class Capped(logging.Handler):

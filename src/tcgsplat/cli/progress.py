@@ -1,7 +1,6 @@
 """Progress of a run on a terminal, as an observer of its reports; silent in a pipe."""
 
 import logging
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -78,12 +77,6 @@ class RunProgress:
         elif self._lost_since is not None:
             logger.warning("tracking is found again at frame %d", report.frame_index)
             self._lost_since = None
-
-
-def say(sentence: str) -> None:
-    """A line to a person who watches: on standard error if that is a terminal, else nowhere."""
-    if sys.stderr.isatty():
-        sys.stderr.write(f"{sentence}\n")
 
 
 @contextmanager

@@ -16,7 +16,8 @@ import torch
 
 from tcgsplat.cli.interrupt import stopping_on_interrupt
 from tcgsplat.cli.kernels import compile_kernels
-from tcgsplat.cli.progress import RunProgress, say
+from tcgsplat.cli.logs import say
+from tcgsplat.cli.progress import RunProgress
 from tcgsplat.cli.summary import Summary, Tally
 from tcgsplat.config import SlamConfig, from_toml, settings, to_toml
 from tcgsplat.datasets import Sequence, open_sequence
@@ -122,6 +123,7 @@ def recorded(
     *,
     realtime: bool = False,
     watch: Watch | None = None,
+    waited: float = 0.0,
 ) -> Summary:
     """A whole run with progress on the terminal, or what is left of one; its summary is on disk too.
 
@@ -133,6 +135,7 @@ def recorded(
         preset: What the settings started from, for the summary.
         realtime: Play the frames at the pace of their time stamps and drop those that come too fast.
         watch: Sees every step, as in `record`.
+        waited: Seconds for which compiling has been waited for before.
 
     Raises:
         KeyboardInterrupt: at the second Ctrl-C, saying what is on disk.
@@ -141,7 +144,7 @@ def recorded(
     # A frame's arrays are small: handing an operation to a second thread costs more than it saves, measured 141 against
     # 104 ms a frame, and the splat kernels have threads of their own.
     torch.set_num_threads(1)
-    compiling = compile_kernels(config, rasterizer)
+    compiling = waited + compile_kernels(config, rasterizer)
     checkpoint = run.checkpoint()
     if checkpoint is None:
         slam = Slam(config, rasterizer, live=realtime, store=run)

@@ -35,7 +35,8 @@ def command(args: Args) -> int:
 
     from tcgsplat.cli.interrupt import stopping_on_interrupt
     from tcgsplat.cli.kernels import compile_kernels
-    from tcgsplat.cli.progress import counting, say
+    from tcgsplat.cli.logs import say
+    from tcgsplat.cli.progress import counting
     from tcgsplat.cli.usage import UsageError
     from tcgsplat.config import from_toml
     from tcgsplat.mapping.refinement import for_seconds, for_steps, refined

@@ -57,27 +57,30 @@ class Args:
 
 def command(args: Args) -> int:
     """Run, and say in one line what came of it."""
-    from tcgsplat.cli.progress import say
-    from tcgsplat.cli.recorder import Part, begin, recorded, resume
-    from tcgsplat.cli.settings import resolved
-    from tcgsplat.render.backends import open_rasterizer
-
     if args.resume and (args.overwrite or args.realtime):
         raise UsageError("--resume goes with neither --overwrite nor --realtime, which repeats nothing; leave one out")
     if args.max_gpu_memory is not None and not args.max_gpu_memory > 0:
         raise UsageError(f"--max-gpu-memory is {args.max_gpu_memory:g}; give the GB that may be taken, above 0")
-    limit = {} if args.max_gpu_memory is None else {"mapper.max_gpu_memory": repr(args.max_gpu_memory)}
-    config = resolved(args.preset, args.config, {**args.settings, **limit}, args.seed)
-    part = Part(args.start, args.stride, args.limit)
-    sequence = part.open(args.folder)
-    rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
-    say(f"drawing with {rasterizer.name} on {rasterizer.device}")
-    out = args.out or Path("runs") / sequence.name
-    if args.resume and (out / "run.json").exists():
-        run = resume(out, config, args.folder, part, backend=rasterizer.name)
-    else:
-        run = begin(out, config, args.folder, part, overwrite=args.overwrite, backend=rasterizer.name)
-    summary = recorded(sequence, config, rasterizer, run, args.preset, realtime=args.realtime)
+    from tcgsplat.cli.ahead import compiled_meanwhile
+    from tcgsplat.cli.logs import say
+
+    with compiled_meanwhile() as waited:
+        from tcgsplat.cli.recorder import Part, begin, recorded, resume
+        from tcgsplat.cli.settings import resolved
+        from tcgsplat.render.backends import open_rasterizer
+
+        limit = {} if args.max_gpu_memory is None else {"mapper.max_gpu_memory": repr(args.max_gpu_memory)}
+        config = resolved(args.preset, args.config, {**args.settings, **limit}, args.seed)
+        part = Part(args.start, args.stride, args.limit)
+        sequence = part.open(args.folder)
+        rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
+        say(f"drawing with {rasterizer.name} on {rasterizer.device}")
+        out = args.out or Path("runs") / sequence.name
+        if args.resume and (out / "run.json").exists():
+            run = resume(out, config, args.folder, part, backend=rasterizer.name)
+        else:
+            run = begin(out, config, args.folder, part, overwrite=args.overwrite, backend=rasterizer.name)
+    summary = recorded(sequence, config, rasterizer, run, args.preset, realtime=args.realtime, waited=waited.seconds)
     if summary.interrupted:
         sys.stderr.write(f"tcgsplat: stopped; saved {summary}: {run.path}\n")
         return 130

@@ -12,7 +12,7 @@ from tcgsplat import datasets
 from tcgsplat.cli.bench import Ablation, tables
 from tcgsplat.cli.bench.arms import ARMS, Arm, faulty, walked
 from tcgsplat.cli.kernels import compile_kernels
-from tcgsplat.cli.progress import say
+from tcgsplat.cli.logs import say
 from tcgsplat.cli.recorder import Part
 from tcgsplat.cli.settings import resolved
 from tcgsplat.cli.summary import machine, versions

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from tcgsplat.cli.bench.performing import KEPT, Job, Outcome, attempted, finished, made
+from tcgsplat.cli.logs import say
 from tcgsplat.cli.main import ENVIRONMENT
-from tcgsplat.cli.progress import say
 from tcgsplat.cli.usage import UsageError
 from tcgsplat.errors import BackendUnavailableError
 from tcgsplat.render.numba_cpu.workers import available_cores

@@ -15,7 +15,8 @@ from tcgsplat.cli.bench import Confidence
 from tcgsplat.cli.bench.tables import markdown
 from tcgsplat.cli.bench.watching import Observer, Predictions, leave_one_out, pairs_of, summary
 from tcgsplat.cli.kernels import compile_kernels
-from tcgsplat.cli.progress import RunProgress, say
+from tcgsplat.cli.logs import say
+from tcgsplat.cli.progress import RunProgress
 from tcgsplat.cli.recorder import Part
 from tcgsplat.cli.settings import resolved
 from tcgsplat.cli.summary import machine, versions

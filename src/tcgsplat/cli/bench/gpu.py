@@ -21,7 +21,7 @@ from tcgsplat.cli.bench.render import Size, Times
 from tcgsplat.cli.bench.suites import Source
 from tcgsplat.cli.bench.tables import NONE, markdown
 from tcgsplat.cli.bench.track import measured
-from tcgsplat.cli.progress import say
+from tcgsplat.cli.logs import say
 from tcgsplat.cli.recorder import Part
 from tcgsplat.cli.settings import resolved
 from tcgsplat.cli.summary import machine, versions

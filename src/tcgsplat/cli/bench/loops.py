@@ -11,7 +11,8 @@ from pathlib import Path
 import torch
 
 from tcgsplat.cli.bench import Loops
-from tcgsplat.cli.progress import counting, say
+from tcgsplat.cli.logs import say
+from tcgsplat.cli.progress import counting
 from tcgsplat.cli.recorder import Part, begin, recorded
 from tcgsplat.cli.summary import machine, versions
 from tcgsplat.config import SlamConfig, from_toml

@@ -10,7 +10,7 @@ from tcgsplat.cli.bench import Recorded, SuiteArgs, Synthetic
 from tcgsplat.cli.bench.page import Results, write_page
 from tcgsplat.cli.bench.performing import Job, Outcome, attempted, finished, made
 from tcgsplat.cli.bench.suites import SUITES, Source, Suite
-from tcgsplat.cli.progress import say
+from tcgsplat.cli.logs import say
 from tcgsplat.cli.recorder import Part
 from tcgsplat.cli.settings import resolved
 from tcgsplat.cli.usage import UsageError

@@ -10,7 +10,7 @@ import hashlib
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -59,7 +59,7 @@ _SOURCES = _digest()
 def kernel(types: str) -> Callable[[Any], Any]:
     """A kernel that Python calls, always with arguments of these types (as numba writes them: "f4[::1], i8").
 
-    It is compiled when it is first called, or by `compile_missing`, and anew when any of the sources is another.
+    It is compiled when it is first called, or in `compiled`, and anew when any of the sources is another.
     """
 
     def decorate(function: Any) -> Any:
@@ -109,20 +109,35 @@ def kernels_of(modules: Sequence[str]) -> list[Kernel]:
     return found
 
 
-def compile_missing(kernels: Sequence[Kernel], processes: int) -> None:
-    """Compile kernels in this process and in others beside it, which import nothing but kernels.
+@contextmanager
+def compiled(kernels: Sequence[Kernel], processes: int) -> Iterator[None]:
+    """Have kernels compiled by the end: by other processes while inside, and at last by this one too.
 
-    Numba has one lock around its compiler, so threads would wait for each other. What another process could not do,
-    for whatever reason, is left to this one's first call.
+    The others import nothing but kernels. (Numba has one lock around its compiler: threads would wait for each other.)
+    What one of them could not do, for whatever reason, is left to this process's first call.
     """
     left, helping = iter(kernels), min(processes, len(kernels), _MOST_PROCESSES) - 1
     helpers = [Thread(target=_compile_elsewhere, args=(left,), daemon=True) for _ in range(helping)]
     for helper in helpers:
         helper.start()
-    for kernel in left:
-        kernel.compile()
+    yield
+    with _uncollected():
+        for kernel in left:
+            kernel.compile()
     for helper in helpers:
         helper.join()
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Without the collector of garbage: it looks at all that torch has made, again and again as the compiler makes more."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
 
 
 def _compile_elsewhere(kernels: Iterator[Kernel]) -> None:

@@ -1,0 +1,50 @@
+"""Compiling kernels while torch is imported: this module imports none of it."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Final
+
+from tcgsplat.cli.logs import say
+from tcgsplat.render.numba_cpu.compilation import Kernel, compiled, kernels_of
+from tcgsplat.render.numba_cpu.workers import available_cores
+
+MODULES: Final = (
+    "tcgsplat.render.numba_cpu.pass_kernels",
+    "tcgsplat.mapping.loss_kernels",
+    "tcgsplat.mapping.native_kernels",
+    "tcgsplat.tracking.alignment_kernels",
+    "tcgsplat.mapping.seeding_kernels",
+    "tcgsplat.tracking.synchronization_kernels",
+    "tcgsplat.tracking.smoothing_kernels",
+)
+"""What a run on the CPU draws on; what takes long to compile first, so that processes finish together."""
+ANNOUNCEMENT: Final = "compiling kernels, once per machine: some seconds"
+
+
+def missing_kernels() -> list[Kernel]:
+    """Those of a run on the CPU that are not on disk."""
+    return [kernel for kernel in kernels_of(MODULES) if not kernel.kept]
+
+
+@dataclass
+class Waited:
+    """Seconds that compiling made somebody wait for."""
+
+    seconds: float = 0.0
+
+
+@contextmanager
+def compiled_meanwhile() -> Iterator[Waited]:
+    """Compile what is missing beside what is done inside, which should be long imports; says so if there is any.
+
+    Gives how long it took beyond that, once it is over.
+    """
+    waited, kernels = Waited(), missing_kernels()
+    if kernels:
+        say(ANNOUNCEMENT)
+    with compiled(kernels, available_cores()):
+        yield waited
+        inside = time.perf_counter()
+    waited.seconds = time.perf_counter() - inside
