@@ -34,20 +34,23 @@ class Args:
 
 def command(args: Args) -> int:
     """All of it, ending with a few lines on how it went and where everything is."""
+    from tcgsplat.cli.ahead import compiled_meanwhile
     from tcgsplat.cli.logs import say
-    from tcgsplat.cli.progress import counting
-    from tcgsplat.cli.recorder import Part, begin, recorded
-    from tcgsplat.cli.scoring import scored
-    from tcgsplat.cli.settings import resolved
-    from tcgsplat.cli.synth import warn_of_speed
-    from tcgsplat.datasets.synthetic import SynthConfig, synthesize
-    from tcgsplat.render.backends import open_rasterizer
-    from tcgsplat.storage.ply import write_gaussians
-    from tcgsplat.storage.world_map import world_map
 
-    config = resolved(args.preset, None, args.settings, None)
-    rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
-    make_way(args.out, overwrite=args.overwrite)
+    with compiled_meanwhile() as waited:
+        from tcgsplat.cli.progress import counting
+        from tcgsplat.cli.recorder import Part, begin, recorded
+        from tcgsplat.cli.scoring import scored
+        from tcgsplat.cli.settings import resolved
+        from tcgsplat.cli.synth import warn_of_speed
+        from tcgsplat.datasets.synthetic import SynthConfig, synthesize
+        from tcgsplat.render.backends import open_rasterizer
+        from tcgsplat.storage.ply import write_gaussians
+        from tcgsplat.storage.world_map import world_map
+
+        config = resolved(args.preset, None, args.settings, None)
+        rasterizer = open_rasterizer(args.backend)  # type: ignore[arg-type]  # it checks the name
+        make_way(args.out, overwrite=args.overwrite)
     walk = SynthConfig(args.frames, args.width, 3 * args.width // 4)
     warn_of_speed(walk)
     data = args.out / "sequence"
@@ -56,7 +59,7 @@ def command(args: Args) -> int:
         synthesize(data, walk, progress)
     sequence = Part().open(data)
     run = begin(args.out / "run", config, data, Part(), overwrite=False)
-    summary = recorded(sequence, config, rasterizer, run, args.preset)
+    summary = recorded(sequence, config, rasterizer, run, args.preset, waited=waited.seconds)
     if summary.interrupted:
         sys.stderr.write(f"tcgsplat: stopped; saved {summary}: {run.path}\n")
         return 130
