@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 from numba import njit
+from numba.core.errors import TypingError
 
 from tcgsplat.render.numba_cpu import lanes, simd
 from tcgsplat.render.numba_cpu.compilation import FLAGS
@@ -207,3 +208,53 @@ def test_first_lanes_are_all_that_is_touched(count):
     np.testing.assert_array_equal(out[:count], source[16 - count :] if count else [])
     assert (out[count:32] == -1).all()
     assert (out[32 + count :] == 0).all()
+
+
+@simd.formula
+def _turned(a, b, more):
+    """Python's own tuples, comprehensions, numbers of NumPy and of Python on either side, another formula, a minus."""
+    first, (second, third) = more
+    mixed = tuple(1 - np.float32(2) * x for x in (a, -b))
+    return mixed[0] / 4 + first, (simd.maximum(mixed[1], 0), np.float32(0.5) * second - third)
+
+
+@_compiled
+def _call(x, y, factor, count, out):
+    a, b = lanes.load(x, 0), lanes.load(y, 0)
+    first, (second, third) = _turned(a, b, (factor, (count, b)))
+    lanes.store_rows(out, 0, 16, (first, second, third))
+
+
+def test_a_formula_takes_and_gives_tuples_and_spreads_numbers():
+    x, y = np.linspace(-2, 2, 16, dtype=np.float32), np.linspace(3, -1, 16, dtype=np.float32)
+    out = np.zeros(48, np.float32)
+    _call(x, y, np.float32(7), 5, out)
+    expected = [(1 - 2 * x) / 4 + 7, np.maximum(1 + 2 * y, 0), 2.5 - y]
+    np.testing.assert_allclose(out.reshape(3, 16), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_a_formula_takes_no_doubles():
+    """They would lose digits without a word."""
+    with pytest.raises(TypingError, match="_turned"):
+        _call(np.zeros(16, np.float32), np.zeros(16, np.float32), 7.0, 5, np.zeros(48, np.float32))
+
+
+@_compiled
+def _mix(a, out):
+    rows = lanes.load_rows(a, 0, 16, 4)
+    lanes.store_rows(out, 0, 16, lanes.even_and_odd(rows[0], rows[1]))
+    lanes.store_rows(out, 32, 16, lanes.side_by_side(rows[0], rows[1], rows[2], rows[3]))
+    lanes.store(out, 96, simd.ramp(5, 3))
+    lanes.store(out, 112, simd.apart(rows[0], rows[1]))
+    lanes.add_rows(out, 96, 16, (rows[2], rows[3]))
+
+
+def test_lanes_are_taken_apart_and_put_side_by_side():
+    a = np.random.default_rng(0).permutation(64).astype(np.float32)
+    out = np.zeros(128, np.float32)
+    _mix(a, out)
+    rows = a.reshape(4, 16)
+    np.testing.assert_array_equal(out[:32].reshape(2, 16), [a[0:32:2], a[1:32:2]])
+    np.testing.assert_array_equal(out[32:96].reshape(16, 4), rows.T)
+    np.testing.assert_array_equal(out[96:112], 5 + 3 * np.arange(16) + rows[2])
+    np.testing.assert_array_equal(out[112:], np.abs(rows[0] - rows[1]) + rows[3])
