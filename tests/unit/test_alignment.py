@@ -186,7 +186,8 @@ class TestKernels:
         np.testing.assert_array_equal(marked, np.where(alpha > 0.5, depth, -1))
 
         seen = replace(frame, color=planar, valid=torch.ones(60, 80, dtype=torch.bool))
-        intensity, marked = rendered_view(rendering_of(seen, alpha=torch.from_numpy(alpha)), 0.5)
+        rendering = rendering_of(seen, alpha=torch.from_numpy(alpha))
+        intensity, marked = rendered_view(rendering, luma(rendering.color), 0.5)
         np.testing.assert_allclose(intensity[alpha > 1e-3], grey[alpha > 1e-3], rtol=1e-5)
         assert not intensity[0, :2].any()
         np.testing.assert_allclose(marked, np.where(alpha > 0.5, depth, -1), rtol=1e-6)

@@ -68,8 +68,8 @@ def test_lane_sums_puts_each_total_in_its_lane():
 
 @_compiled
 def _transpose(matrix, out):
-    lanes.store_transposed(out, 0, lanes.load_transposed(matrix, 0))
-    lanes.store(out, 256, lanes.load_transposed(matrix, 0)[3])
+    lanes.store_rows(out, 0, 16, lanes.columns_of(lanes.columns_of(lanes.load_rows(matrix, 0, 16, 16))))
+    lanes.store(out, 256, lanes.columns_of(lanes.load_rows(matrix, 0, 16, 16))[3])
 
 
 def test_transposed_load_and_store_are_inverse():
@@ -156,7 +156,7 @@ def test_gather_takes_a_value_for_every_lane():
 @_compiled
 def _squares(image, x, y, out):
     squares = lanes.gather_squares(image, 4 * image.shape[1], lanes.load(x, 0), lanes.load(y, 0))
-    lanes.store_transposed(out, 0, squares)
+    lanes.store_rows(out, 0, 16, lanes.columns_of(squares))
 
 
 def test_gather_squares_takes_four_pixels_for_every_lane():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from tcgsplat.cli.logs import say
-from tcgsplat.render.numba_cpu.compilation import Kernel, compiled, kernels_of
+from tcgsplat.render.numba_cpu.compilation import compiled, kernels_of
 from tcgsplat.render.numba_cpu.workers import available_cores
 
 MODULES: Final = (
@@ -23,11 +23,6 @@ MODULES: Final = (
 ANNOUNCEMENT: Final = "compiling kernels, once per machine: some seconds"
 
 
-def missing_kernels() -> list[Kernel]:
-    """Those of a run on the CPU that are not on disk."""
-    return [kernel for kernel in kernels_of(MODULES) if not kernel.kept]
-
-
 @dataclass
 class Waited:
     """Seconds that compiling made somebody wait for."""
@@ -41,7 +36,7 @@ def compiled_meanwhile() -> Iterator[Waited]:
 
     Gives how long it took beyond that, once it is over.
     """
-    waited, kernels = Waited(), missing_kernels()
+    waited, kernels = Waited(), [kernel for kernel in kernels_of(MODULES) if not kernel.kept]
     if kernels:
         say(ANNOUNCEMENT)
     with compiled(kernels, available_cores()):

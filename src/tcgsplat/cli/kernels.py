@@ -9,12 +9,10 @@ from typing import Final
 import torch
 from numba.core import event
 
-from tcgsplat.cli.ahead import ANNOUNCEMENT, missing_kernels
+from tcgsplat.cli.ahead import ANNOUNCEMENT, compiled_meanwhile
 from tcgsplat.cli.logs import say
 from tcgsplat.config import SlamConfig, with_settings
 from tcgsplat.geometry.camera import Camera
-from tcgsplat.render.numba_cpu.compilation import compiled
-from tcgsplat.render.numba_cpu.workers import available_cores
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.frame import Frame
 from tcgsplat.slam import Slam
@@ -41,10 +39,10 @@ def compile_kernels(config: SlamConfig, rasterizer: Rasterizer) -> float:
         Seconds that it took: a fraction of one where the kernels are on disk.
     """
     started = time.perf_counter()
+    if rasterizer.name == "numba":
+        with compiled_meanwhile():
+            pass
     with _heard_compiling(partial(say, ANNOUNCEMENT)):
-        if rasterizer.name == "numba":
-            with compiled(missing_kernels(), available_cores()):
-                pass
         slam = Slam(with_settings(config, _ONE_STEP), rasterizer)
         for index in range(2):
             slam.step(_wall(index))

@@ -163,8 +163,9 @@ def _levels(frame: Frame, rendering: Rendering, weight: Plane, config: Alignment
     shows, which optimisation closes in time: dividing makes them too bright, not dividing leaves them too dark. So
     exposure is told by colours that are not divided, where the map is all but opaque.
     """
-    intensity, depth = rendered_view(rendering, config.min_alpha)
-    composited, solid = luma(rendering.color), np.where(rendering.alpha.numpy() > SOLID, depth, NOTHING)
+    composited = luma(rendering.color)
+    intensity, depth = rendered_view(rendering, composited, config.min_alpha)
+    solid = np.where(rendering.alpha.numpy() > SOLID, depth, NOTHING)
     solid_points: Floats = np.empty((0, 0), np.float32)
     weights = np.ascontiguousarray(weight.numpy())
     live, live_depth = live_view(frame)

@@ -41,16 +41,15 @@ def live_view(frame: Frame) -> tuple[Floats, Floats]:
     return luma(frame.color), np.where(frame.valid.numpy(), frame.depth.numpy(), NOTHING)
 
 
-def rendered_view(rendering: Rendering, min_alpha: float) -> tuple[Floats, Floats]:
+def rendered_view(rendering: Rendering, composited: Floats, min_alpha: float) -> tuple[Floats, Floats]:
     """Intensity and marked depth without the background: what is hardly covered saw nothing.
 
-    So its black does not bleed into the coarse levels' points.
+    So its black does not bleed into the coarse levels' points. `composited` is the rendering's intensity, with it.
     """
     alpha: Floats = rendering.alpha.numpy()
     inverse = np.maximum(alpha, kernels.THIN)
     np.divide(np.float32(1), inverse, out=inverse)
-    intensity, depth = luma(rendering.color), rendering.composited_plane_depth.numpy() * inverse
-    intensity *= inverse
+    intensity, depth = composited * inverse, rendering.composited_plane_depth.numpy() * inverse
     depth[alpha <= min_alpha] = NOTHING
     return intensity, depth
 

@@ -1,6 +1,5 @@
 """Memory to vectors and back, and what goes across their lanes; arithmetic is in `simd.py`."""
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -71,9 +70,8 @@ def store_int32_pairs(typingctx: Any, array: Any, index: Any, first: Any, second
 
 def _first_lanes(builder: Any, count: Any) -> Any:
     """Which lanes come before `count`, an int64."""
-    undefined, lanes = ir.Constant(INTEGERS, ir.Undefined), ir.Constant(INTEGERS, list(range(LANES)))
-    first = builder.insert_element(undefined, builder.trunc(count, _I32), ir.Constant(_I32, 0))
-    return builder.icmp_signed("<", lanes, builder.shuffle_vector(first, undefined, ir.Constant(INTEGERS, [0] * LANES)))
+    lanes = ir.Constant(INTEGERS, list(range(LANES)))
+    return builder.icmp_signed("<", lanes, spread_value(builder, builder.trunc(count, _I32)))
 
 
 @intrinsic
@@ -206,18 +204,13 @@ def append_where_bit(typingctx: Any, out: Any, count: Any, masks: Any, start: An
         out_value, count_value, masks_value, start_value, bit_value, length_value = args
         lanes = ir.Constant(INTEGERS, list(range(LANES)))
 
-        def spread_int(value: Any) -> Any:
-            undefined = ir.Constant(INTEGERS, ir.Undefined)
-            first = builder.insert_element(undefined, value, ir.Constant(_I32, 0))
-            return builder.shuffle_vector(first, undefined, ir.Constant(INTEGERS, [0] * LANES))
-
         masks_pointer = _pointer(context, builder, sig.args[2], masks_value, start_value, INTEGERS)
         has_bit = builder.icmp_signed(
             "!=",
-            builder.and_(builder.load(masks_pointer, align=4), spread_int(bit_value)),
+            builder.and_(builder.load(masks_pointer, align=4), spread_value(builder, bit_value)),
             ir.Constant(INTEGERS, [0] * LANES),
         )
-        inside = builder.icmp_signed("<", lanes, spread_int(length_value))
+        inside = builder.icmp_signed("<", lanes, spread_value(builder, length_value))
         chosen = builder.and_(has_bit, inside)
         pointer = _pointer(context, builder, sig.args[0], out_value, count_value, _I32)
         first = builder.trunc(start_value, _I32)
@@ -229,7 +222,7 @@ def append_where_bit(typingctx: Any, out: Any, count: Any, masks: Any, start: An
                 ir.FunctionType(INTEGERS, [INTEGERS, INTEGERS, _BITS]),
                 f"llvm.x86.avx512.mask.compress.v{LANES}i32",
             )
-            indices = builder.add(lanes, spread_int(first))
+            indices = builder.add(lanes, spread_value(builder, first))
             compressed = builder.call(compress, [indices, ir.Constant(INTEGERS, [0] * LANES), chosen])
             builder.store(compressed, builder.bitcast(pointer, INTEGERS.as_pointer()), align=4)
             count_bits = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_I16, [_I16]), "llvm.ctpop.i16")
@@ -306,7 +299,8 @@ def sum_lanes(typingctx: Any, a: Any) -> Any:
     return types.float32(float32x16), lower
 
 
-def _transposed(rows: Sequence[Vector]) -> Vectors:
+@formula
+def columns_of(rows: Vectors) -> Vectors:
     """Sixteen vectors as the rows of a matrix, transposed by four rounds of butterfly shuffles."""
     vectors = list(rows)
     for group in (1, 2, 4, 8):
@@ -317,35 +311,6 @@ def _transposed(rows: Sequence[Vector]) -> Vectors:
                 a, b = vectors[row], vectors[row | group]
                 vectors[row], vectors[row | group] = a.shuffled(even, b), a.shuffled(odd, b)
     return tuple(vectors)
-
-
-@intrinsic
-def store_transposed(typingctx: Any, array: Any, index: Any, columns: Any) -> Any:
-    """Write a tuple of sixteen vectors as the columns of a row-major 16 x 16 matrix that begins at `index`."""
-
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        rows = _transposed([Vector(builder, builder.extract_value(args[2], k)) for k in range(LANES)])
-        for number, row in enumerate(rows):
-            at = builder.add(args[1], ir.Constant(_I64, number * LANES))
-            builder.store(row.value, _pointer(context, builder, sig.args[0], args[0], at, VECTOR), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, columns), lower
-
-
-@intrinsic
-def load_transposed(typingctx: Any, array: Any, index: Any) -> Any:
-    """The columns of the row-major 16 x 16 matrix that begins at `index`, as a tuple of vectors."""
-
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        rows = []
-        for number in range(LANES):
-            at = builder.add(args[1], ir.Constant(_I64, number * LANES))
-            row = builder.load(_pointer(context, builder, sig.args[0], args[0], at, VECTOR), align=4)
-            rows.append(Vector(builder, row))
-        return context.make_tuple(builder, sig.return_type, [column.value for column in _transposed(rows)])
-
-    return types.UniTuple(float32x16, LANES)(array, types.int64), lower
 
 
 @formula
@@ -421,9 +386,7 @@ def gather_squares(typingctx: Any, image: Any, pitch: Any, x: Any, y: Any) -> An
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         image_value, pitch_value, x_value, y_value = args
-        undefined = ir.Constant(INTEGERS, ir.Undefined)
-        row = builder.insert_element(undefined, builder.trunc(pitch_value, _I32), ir.Constant(_I32, 0))
-        rows = builder.shuffle_vector(row, undefined, ir.Constant(INTEGERS, [0] * LANES))
+        rows = spread_value(builder, builder.trunc(pitch_value, _I32))
         columns = builder.mul(builder.fptosi(x_value, INTEGERS), ir.Constant(INTEGERS, [4] * LANES))
         starts = builder.add(builder.mul(builder.fptosi(y_value, INTEGERS), rows), columns)
         two_pixels, both_rows = ir.VectorType(F32, 8), ir.Constant(INTEGERS, list(range(LANES)))
@@ -435,6 +398,6 @@ def gather_squares(typingctx: Any, image: Any, pitch: Any, x: Any, y: Any) -> An
                 for at in (start, builder.add(start, pitch_value))
             )
             squares.append(Vector(builder, builder.shuffle_vector(above, below, both_rows)))
-        return context.make_tuple(builder, sig.return_type, [channel.value for channel in _transposed(squares)])
+        return context.make_tuple(builder, sig.return_type, [channel.value for channel in columns_of(tuple(squares))])
 
     return types.UniTuple(float32x16, LANES)(image, types.int64, float32x16, float32x16), lower

@@ -15,18 +15,17 @@ from tcgsplat.render.conventions import BLUR, MIN_ALPHA, NEAR_PLANE, PLANE_SOFTE
 from tcgsplat.render.numba_cpu.compilation import inner
 from tcgsplat.render.numba_cpu.lanes import (
     add_rows,
+    columns_of,
     lane_sums,
     load,
     load_first,
     load_rows,
     load_spread,
-    load_transposed,
     prefetch,
     stack_floats,
     store,
     store_int32_pairs,
     store_rows,
-    store_transposed,
 )
 from tcgsplat.render.numba_cpu.layout import (
     CAMERA,
@@ -197,7 +196,7 @@ def forward(P, start, stop, cam, tiles_x, records, depths, rectangles):
         )  # fmt: skip
         store_int32_pairs(rectangles, 2 * i, first, span)
         store(depths, i, depth)
-        store_transposed(records, i * RECORD, record)
+        store_rows(records, i * RECORD, RECORD, columns_of(record))
 
 
 @formula
@@ -293,7 +292,7 @@ def backward(P, n, start, stop, cam, slot_starts, pair_sums, grads, first, pose)
             store(sums, k * RECORD, total)
         by_parameters, by_pose = _chained(
             load_spread(cam, 0, CAMERA), load_rows(P, at + 16 * MEAN, 16, 3), load_rows(P, at + 16 * QUAT, 16, 4),
-            load_rows(P, at + 16 * SCALE, 16, 3), load_transposed(sums, 0),
+            load_rows(P, at + 16 * SCALE, 16, 3), columns_of(load_rows(sums, 0, RECORD, 16)),
         )  # fmt: skip
         store_rows(grads, at - PARAMETERS * first, 16, by_parameters)
         add_rows(totals, 0, 16, by_pose)

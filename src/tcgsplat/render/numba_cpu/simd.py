@@ -49,8 +49,8 @@ class _Float32x16Model(models.PrimitiveModel):
 
 
 def spread_value(builder: Any, scalar: Any) -> Any:
-    """A scalar LLVM value in all lanes of a vector."""
-    undefined = ir.Constant(VECTOR, ir.Undefined)
+    """A scalar LLVM value in all lanes of a vector of its type."""
+    undefined = ir.Constant(ir.VectorType(scalar.type, LANES), ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(I32, 0))
     return builder.shuffle_vector(first, undefined, ir.Constant(INTEGERS, [0] * LANES))
 
