@@ -13,8 +13,6 @@ UNIT = 1024
 """Splats in a unit of projection and of the chain rule. Fixed, because pose sums are made unit by unit."""
 TILES = 2
 """Tiles in a unit of compositing: side by side, so that the second finds splats of the first in the cache."""
-SPARE = 8
-"""Places after the pairs for each strip: a cache line."""
 
 _VISIBLE, _PAIRS = np.int64(0), np.int64(1)  # columns of `tiling.tally`
 
@@ -82,7 +80,7 @@ def arrange(
             elif phase == PLACE_TILES:
                 tiling.places(tile_counts, tile_ends)
                 for strip in range(strips):
-                    tile_counts[strip, tile_ends.size - 1] = tile_ends[tile_ends.size - 1] + SPARE * strip
+                    tile_counts[strip, tile_ends.size - 1] = tile_ends[tile_ends.size - 1] + tiling.LINE * strip
             elif step == 1:
                 tiling.places(digit_counts, digit_ends)
             else:

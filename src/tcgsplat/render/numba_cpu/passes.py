@@ -153,11 +153,11 @@ class Passes:
         tiles, strips, units = tiles_x * tiles_y, self.workers.threads, -(-padded // kernels.UNIT)
         records, depths = space.floats("records", padded * RECORD), space.floats("depths", padded)
         rectangles, slot_starts = space.counts("rectangles", 2 * padded), space.counts("slot_starts", padded + 1)
-        entries, unit_sums = space.longs("entries", padded), space.longs("unit_sums", units, 3)
+        entries, unit_sums = space.longs("entries", padded + tiling.LINE), space.longs("unit_sums", units, 3)
         tile_counts, tile_ends = space.counts("tile_counts", strips, tiles + 1), space.ints("tile_ends", tiles + 1)
         arranging = (
             flat, padded, cam, tiles_x, records, depths, depths.view(np.int32), rectangles, unit_sums, slot_starts,
-            entries, space.longs("swapped", padded), space.counts("digit_counts", strips, tiling.DIGIT_VALUES),
+            entries, space.longs("swapped", padded + tiling.LINE), space.counts("digit_counts", strips, tiling.DIGIT_VALUES),
             space.ints("digit_ends", tiling.DIGIT_VALUES + 1), tile_counts, tile_ends,
         )  # fmt: skip
         self._run(
@@ -169,7 +169,7 @@ class Passes:
 
         visible, pair_count, _ = (int(total) for total in unit_sums.sum(axis=0))
         longest = int(np.diff(tile_ends).max())
-        pairs = space.longs("pairs", pair_count + kernels.SPARE * strips)
+        pairs = space.longs("pairs", pair_count + tiling.LINE * (strips + 1))
         masks = space.ints("masks", pair_count)
         local = space.floats("local", strips, max((longest + 1) * RECORD, BACKWARD_FLOATS))
         lists = space.ints("lists", strips, 3, -(-(longest + 16) // 16) * 16)

@@ -10,12 +10,15 @@ import numpy as np
 
 from tcgsplat.render.conventions import NEAR_PLANE
 from tcgsplat.render.numba_cpu.compilation import inner
-from tcgsplat.render.numba_cpu.lanes import prefetch
+from tcgsplat.render.numba_cpu.lanes import prefetch, prefetch_to_write
 from tcgsplat.render.numba_cpu.layout import SPAN_UNIT, SPLAT
 
 DIGIT_BITS = 13
 DIGIT_VALUES = 1 << DIGIT_BITS
 _DIGIT_MASK = DIGIT_VALUES - 1
+LINE = 8
+"""Entries, or pairs, of a cache line. Lists have room for one more at their end: where one is written to in thousands of
+places by turns, the line after each place is asked for as soon as the place is used, or every eighth write would wait."""
 _AHEAD = 24  # splats asked for in advance: in order of depth they are anywhere in memory
 _BEYOND_TWO = ~(1 | SPAN_UNIT)
 _NEAREST = int(np.float32(NEAR_PLANE).view(np.int32))
@@ -96,6 +99,7 @@ def move(entries, start, stop, shift, cursors, moved):  # type: ignore[no-untype
         place = cursors[value]
         cursors[value] = place + 1
         moved[place] = entry
+        prefetch_to_write(moved, np.int64(place) + LINE)
 
 
 @inner
@@ -141,18 +145,22 @@ def fill_tiles(entries, start, stop, rectangles, slot_starts, tiles_x, cursors, 
             place = np.int64(cursors[first])
             cursors[first] = place + 1
             pairs[place] = slot << 32 | i
+            prefetch_to_write(pairs, place + LINE)
             tile = first + 1 if dx else spare
             place = np.int64(cursors[tile])
             cursors[tile] = place + dx
             pairs[place] = (slot + 1) << 32 | i
+            prefetch_to_write(pairs, place + LINE)
             tile = first + tiles_x if dy else spare
             place = np.int64(cursors[tile])
             cursors[tile] = place + dy
             pairs[place] = (slot + 1 + dx) << 32 | i
+            prefetch_to_write(pairs, place + LINE)
             tile = first + tiles_x + 1 if dx & dy else spare
             place = np.int64(cursors[tile])
             cursors[tile] = place + (dx & dy)
             pairs[place] = (slot + 3) << 32 | i
+            prefetch_to_write(pairs, place + LINE)
         else:
             for row in range((span >> 12) + 1):
                 for tile in range(first + row * tiles_x, first + row * tiles_x + (span & (SPAN_UNIT - 1)) + 1):
