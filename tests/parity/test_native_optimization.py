@@ -75,7 +75,7 @@ def test_takes_the_steps_of_autograd(submap: Submap, guidance: str, depth_mode: 
         for step, view in enumerate((0, 1, 1)):
             if step == 1:
                 optimization.prune()
-            optimization.step(view)
+            optimization.steps([view])
             losses.append(optimization.loss)
         results.append((optimization.submap(), losses))
     (slow, slow_losses), (fast, fast_losses) = results
@@ -105,7 +105,7 @@ def test_unequal_exposures_are_balanced_alike(submap: Submap) -> None:
         for optimization in both(each, MapperConfig(), CONFIDENCE):
             losses = []
             for view in (0, 1, 1):
-                optimization.step(view)
+                optimization.steps([view])
                 losses.append(optimization.loss)
             results.append((losses, optimization.submap().gaussians))
     (slow, slow_map), (fast, fast_map), (_, slow_by_hand), (_, fast_by_hand), (unfelt, _), _ = results
@@ -122,7 +122,7 @@ def test_the_self_distance_is_between_rows_of_the_same_id(submap: Submap) -> Non
     """Of the Gaussians before, some were pruned on the way: nobody may inherit another's history."""
     for optimization in both(submap, MapperConfig(min_opacity=0.952), CONFIDENCE):
         for view in (0, 1):
-            optimization.step(view)
+            optimization.steps([view])
             optimization.prune()
         after = optimization.submap().gaussians
         before = submap.gaussians.kept(torch.isin(submap.gaussians.ids, after.ids))
@@ -142,7 +142,7 @@ def test_the_same_bits_whatever_the_number_of_threads(submap: Submap) -> None:
     for threads in (1, 2, 3):
         optimization = NativeOptimization(submap, MapperConfig(), CONFIDENCE, NumbaRasterizer(threads).passes)
         for view in (1, 0, 1):
-            optimization.step(view)
+            optimization.steps([view])
         results.append((optimization.submap().gaussians, optimization.loss))
     for gaussians, loss in results[1:]:
         assert loss == results[0][1]
@@ -152,7 +152,7 @@ def test_the_same_bits_whatever_the_number_of_threads(submap: Submap) -> None:
 def test_what_is_out_of_view_stays(submap: Submap) -> None:
     away = replace(submap, keyframes=tuple(replace(k, T_map_cam=pose(degrees=(0, 180, 0))) for k in submap.keyframes))
     for optimization in both(away, MapperConfig(), CONFIDENCE):
-        optimization.step(1)
+        optimization.steps([1])
         for name in PARAMETERS:
             assert torch.equal(getattr(optimization.submap().gaussians, name), getattr(submap.gaussians, name))
 
@@ -163,7 +163,7 @@ def test_a_nan_in_a_picture_does_not_reach_the_map(submap: Submap) -> None:
     color[20, 30] = torch.nan
     broken = replace(submap, keyframes=(replace(keyframe, frame=replace(keyframe.frame, color=color)),))
     for optimization in both(broken, MapperConfig(), CONFIDENCE):
-        optimization.step(0)
+        optimization.steps([0])
         for name in PARAMETERS:
             assert bool(getattr(optimization.submap().gaussians, name).isfinite().all())
 
@@ -182,7 +182,7 @@ def test_what_only_autograd_knows_is_left_to_it(submap: Submap) -> None:
 def test_asking_how_far_they_went_does_not_change_the_loss(submap: Submap) -> None:
     optimization = NativeOptimization(submap, MapperConfig(), GUIDANCE["mean"], RASTERIZER.passes)
     for view in (0, 1):
-        optimization.step(view)
+        optimization.steps([view])
     loss = optimization.loss
     optimization.self_distance()
     assert optimization.loss == loss
@@ -200,6 +200,6 @@ def test_a_width_that_is_no_multiple_of_sixteen(submap: Submap) -> None:
     losses = []
     for optimization in both(odd, MapperConfig(), CONFIDENCE):
         for view in (1, 0):
-            optimization.step(view)
+            optimization.steps([view])
             losses.append(optimization.loss)
     assert losses[2:] == pytest.approx(losses[:2], rel=2e-5)

@@ -158,8 +158,8 @@ def test_a_step_of_mapping_waits_for_nothing(
 ) -> None:
     update = AutogradOptimization(experienced(config, confidence, room, distant), config, confidence, distant)
     with counted_waits() as waits:
-        update.step(0, frozen=("sh",))
-        update.step(1)
+        update.steps([0], frozen=("sh",))
+        update.steps([1])
     assert not waits
     assert update.loss > 0
 

@@ -12,7 +12,7 @@ from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import Rendering, render
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
-from tcgsplat.tracking.descent import DescentConfig, descend, weighted_residual
+from tcgsplat.tracking.descent import AmsGrad, DescentConfig, descend, weighted_residual
 
 PLAIN = DescentConfig(
     iterations=50,
@@ -134,3 +134,22 @@ def test_the_guess_may_be_anywhere_in_the_map(room: Room, corner: Submap, raster
 def test_the_loss_of_a_perfect_view_is_zero(room: Room) -> None:
     frame = room.frame()
     assert float(weighted_residual(rendering_of(frame, alpha=1.0), torch.ones_like(frame.depth), frame, PLAIN)) == 0
+
+
+def test_the_poses_adam_is_torchs() -> None:
+    g = torch.Generator().manual_seed(0)
+    ours = [torch.randn(n, generator=g, dtype=torch.float64) for n in (4, 3)]
+    theirs = [p.clone().requires_grad_() for p in ours]
+    rates = 0.002, 0.01
+    adam = AmsGrad(list(zip(ours, rates, strict=True)))
+    expected = torch.optim.Adam(
+        [{"params": [p], "lr": rate} for p, rate in zip(theirs, rates, strict=True)], amsgrad=True
+    )
+    for k in range(30):
+        gradients = [torch.randn(p.shape, generator=g, dtype=torch.float64) / (1 + k) for p in ours]
+        adam.step(gradients)
+        for p, gradient in zip(theirs, gradients, strict=True):
+            p.grad = gradient
+        expected.step()
+    for p, q in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(p, q.detach(), rtol=1e-12, atol=1e-14)

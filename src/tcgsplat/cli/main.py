@@ -37,8 +37,8 @@ ENVIRONMENT: Mapping[str, str] = MappingProxyType(
 cores busy. Numpy's matrices are small here."""
 
 YOUNG = 10_000
-"""Objects that are made before Python looks for cycles among them. Imports make half a million that all stay: by Python's
-own 700, looking through them takes a third of the time to start."""
+"""Objects that are made before Python looks for cycles among them. Imports make half a million that all stay: by
+Python's own 700, looking through them takes a third of the time to start."""
 
 DONE, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
 """Exit codes."""

@@ -1,8 +1,10 @@
 """Mapping: grow the submap where a frame shows something new, then optimise it over its keyframes (Eqs. 20 to 24)."""
 
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import torch
 
@@ -152,11 +154,12 @@ class Mapper:
     def _optimized(self, submap: Submap, iterations: int) -> Optimization:
         """Adam over drawn keyframes; faint Gaussians are dropped halfway and at the end."""
         optimization = begin(submap, self._config, self._confidence, self._rasterizer)
-        for iteration in range(iterations):
-            if iteration == iterations // 2 and iteration > 0:
+        views = [self._drawn_view(len(submap.keyframes)) for _ in range(iterations)]
+        half, colored = iterations // 2, math.ceil(self._config.frozen_color_share * iterations)
+        for start, stop in pairwise(sorted({0, half, colored, iterations})):
+            if start == half > 0:
                 optimization.prune()
-            frozen = ("sh",) if iteration < self._config.frozen_color_share * iterations else ()
-            optimization.step(self._drawn_view(len(submap.keyframes)), frozen)
+            optimization.steps(views[start:stop], ("sh",) if start < colored else ())
         optimization.prune()
         return optimization
 

@@ -1,6 +1,6 @@
 """A mapping update's optimisation by CPU kernels, without autograd; see `optimization.py` for what is optimised."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -91,10 +91,13 @@ class NativeOptimization:
         self._window = ssim_window().numpy()
         self._space = Workspace()
 
-    def step(self, view: int, frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
+    def steps(self, views: Sequence[int], frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
         """See `Optimization`."""
         assert not frozen  # `covers` keeps such settings away
-        target = self._view(view)
+        for view in views:
+            self._step(self._view(view), pace)
+
+    def _step(self, target: _View, pace: float) -> None:
         drawn = self._passes.draw(self._parameters, target.camera, target.T_cam_map)
         d_planes = self._differentiated_losses(target, drawn.planes)
         self._stability_weight = self._confidence.stability_weight / self._count(drawn)

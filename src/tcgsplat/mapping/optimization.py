@@ -4,6 +4,7 @@
 `native_optimization.py` does the same by CPU kernels, without autograd, and is held to it by tests.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
@@ -16,19 +17,20 @@ from tcgsplat.mapping.optimizer import LearningRates, RowAdam
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.losses import color_error, depth_error, isotropy_error, ssim_map
 from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.render.repetition import repeat
 from tcgsplat.render.view import Rendering, render
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Submap
-from tcgsplat.tensors import PerGaussian, PerGaussianFlag
+from tcgsplat.tensors import PerGaussian, PerGaussianFlag, Pose
 
 
 @runtime_checkable
 class Optimization(Protocol):
     """A submap while it is optimised: mutable, made for one mapping update, dropped after it."""
 
-    def step(self, view: int, frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
-        """Follow the gradient of Eq. 21 at one keyframe by one Adam step of every Gaussian in view.
+    def steps(self, views: Sequence[int], frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
+        """At one keyframe after the other follow the gradient of Eq. 21 by one Adam step of every Gaussian in view.
 
         Parameters named in `frozen` stay; `pace` multiplies the learning rates.
         """
@@ -73,12 +75,27 @@ class AutogradOptimization:
         self._submap = submap.to(rasterizer.device)
         self._before = self._submap.gaussians
         self._adam = _row_adam(self._before, config.rates)
-        self._loss_value = torch.zeros(())
+        self._loss_value = torch.zeros((), dtype=torch.float64, device=rasterizer.device)
+        inverses = [se3.inverse(keyframe.T_map_cam) for keyframe in submap.keyframes]
+        self._T_cam_map = torch.stack(inverses).to(rasterizer.device) if inverses else None
 
-    def step(self, view: int, frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
-        """See `Optimization`."""
-        keyframe, gaussians = self._submap.keyframes[view], self._adam.gaussians
-        frame, T_cam_map = keyframe.to(self._rasterizer.device).balanced, se3.inverse(keyframe.T_map_cam)
+    def steps(self, views: Sequence[int], frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
+        """See `Optimization`; all keyframes have the first one's camera."""
+        keyframes, poses, device = self._submap.keyframes, self._T_cam_map, self._rasterizer.device
+        assert poses is not None
+
+        def given(k: int) -> tuple[torch.Tensor, ...]:
+            frame = keyframes[views[k]].to(device).balanced
+            return frame.color, frame.depth, frame.valid, poses[views[k]]
+
+        def step(color: torch.Tensor, depth: torch.Tensor, valid: torch.Tensor, T_cam_map: Pose) -> None:
+            frame = Frame(0, 0.0, color, depth, valid, keyframes[0].frame.camera)
+            self._step(frame, T_cam_map, frozen, pace)
+
+        repeat(self._rasterizer, step, given, len(views), [*self._adam.tables, self._loss_value])
+
+    def _step(self, frame: Frame, T_cam_map: Pose, frozen: tuple[str, ...], pace: float) -> None:
+        gaussians = self._adam.gaussians
         rendering = render(gaussians, self._submap.confidence.value, frame.camera, T_cam_map, self._rasterizer)
         loss = self._loss(rendering, frame, gaussians, self._before, self._submap)
         scale, literal = self._step_scale(self._submap), self._confidence.step_scale_mode == "gradient"
@@ -90,7 +107,7 @@ class AutogradOptimization:
             gradient_scale=scale if literal else None,
             step_scale=None if literal else scale,
         )
-        self._loss_value = loss.detach()
+        self._loss_value.copy_(loss.detach())
 
     def prune(self) -> None:
         """See `Optimization`."""

@@ -91,6 +91,12 @@ class RowAdam:
         """The Gaussians as they are now; differentiable leaves."""
         return replace(self._template, **self._parameters)
 
+    @property
+    def tables(self) -> list[Tensor]:
+        """All that a step changes, in place."""
+        kinds = (self._parameters, self._first, self._second, self._steps)
+        return [table.detach() for tables in kinds for table in tables.values()]
+
     def detached(self) -> Gaussians:
         """The Gaussians as they are now, as plain values that later steps leave alone."""
         return replace(self._template, **{name: p.detach().clone() for name, p in self._parameters.items()})

@@ -46,7 +46,7 @@ def refined(
     steps = 0
     while (done := progress(steps)) < 1:
         order = order or torch.randperm(len(submap.keyframes), generator=generator).tolist()
-        optimization.step(order.pop(), pace=LAST_PACE**done)
+        optimization.steps([order.pop()], pace=LAST_PACE**done)
         steps += 1
     optimization.prune()
     return optimization.submap().to(submap.device)

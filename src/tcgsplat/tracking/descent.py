@@ -5,6 +5,7 @@ gradient of the confidence-weighted residual. The base system turns the camera a
 increment turns it about its own centre, which keeps rotation and translation apart wherever the camera is.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,10 +15,14 @@ from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import quaternion, se3
 from tcgsplat.render.losses import color_error, depth_error
 from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.render.repetition import repeat
 from tcgsplat.render.view import DepthMode, Rendering, render
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Plane, Pose
+
+BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
+"""Of the pose's Adam. [base]"""
 
 
 @dataclass(frozen=True)
@@ -99,23 +104,50 @@ def descend(
     device = rasterizer.device
     frame, submap = frame.to(device), submap.to(device)
     T_cam_map_guess = se3.inverse(guess).to(device)
-    q = torch.eye(4, dtype=torch.float64, device=device)[0].clone().requires_grad_()
-    t = torch.zeros(3, dtype=torch.float64, device=device, requires_grad=True)
-    adam = torch.optim.Adam(
-        [{"params": [q], "lr": config.rotation_rate}, {"params": [t], "lr": config.translation_rate}], amsgrad=True
-    )
+    q = torch.eye(4, dtype=torch.float64, device=device)[0].clone()
+    t = torch.zeros(3, dtype=torch.float64, device=device)
+    adam = AmsGrad([(q, config.rotation_rate), (t, config.translation_rate)])
     # The best pose so far stays on the device with its loss: no iteration waits to know them.
-    best, lowest = T_cam_map_guess, torch.full((), torch.inf, device=device)
-    for _ in range(config.iterations):
-        T_cam_map = se3.from_rotation_translation(quaternion.to_matrix(q), t) @ T_cam_map_guess
+    best, lowest = T_cam_map_guess.clone(), torch.full((), torch.inf, device=device)
+
+    def step() -> None:
+        leaves = q.detach().requires_grad_(), t.detach().requires_grad_()
+        T_cam_map = se3.from_rotation_translation(quaternion.to_matrix(leaves[0]), leaves[1]) @ T_cam_map_guess
         rendering = render(submap.gaussians, submap.confidence.value, frame.camera, T_cam_map, rasterizer)
         weight = (
             torch.ones_like(rendering.alpha) if floor is None else eq.tracking_weight(rendering.confidence, floor=floor)
         )
         loss = weighted_residual(rendering, weight, frame, config)
         better = loss.detach() < lowest
-        best, lowest = torch.where(better, T_cam_map.detach(), best), torch.where(better, loss.detach(), lowest)
-        adam.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        adam.step()
+        best.copy_(torch.where(better, T_cam_map.detach(), best))
+        lowest.copy_(torch.where(better, loss.detach(), lowest))
+        adam.step(torch.autograd.grad(loss, leaves))
+
+    repeat(rasterizer, step, lambda _: (), config.iterations, [*adam.tables, best, lowest])
     return Descent(se3.inverse(best.cpu()), config.iterations, float(lowest))
+
+
+class AmsGrad:
+    """Adam that forgets no gradient's size (Reddi et al. 2018), in place, with all that it counts on the device."""
+
+    def __init__(self, parameters: Sequence[tuple[torch.Tensor, float]]) -> None:
+        """Of parameters with their learning rates."""
+        self._parameters, self._rates = [p for p, _ in parameters], [rate for _, rate in parameters]
+        self._first, self._second, self._most = ([torch.zeros_like(p) for p in self._parameters] for _ in range(3))
+        self._count = torch.zeros_like(self._parameters[0][0])
+
+    @property
+    def tables(self) -> list[torch.Tensor]:
+        """All that a step changes."""
+        return [*self._parameters, *self._first, *self._second, *self._most, self._count]
+
+    def step(self, gradients: Sequence[torch.Tensor]) -> None:
+        """One step against these gradients."""
+        self._count += 1
+        young_1, young_2 = (1 - beta**self._count for beta in (BETA_1, BETA_2))
+        rows = zip(self._rates, self._parameters, gradients, self._first, self._second, self._most, strict=True)
+        for rate, p, g, first, second, most in rows:
+            first.lerp_(g, 1 - BETA_1)
+            second.mul_(BETA_2).addcmul_(g, g, value=1 - BETA_2)
+            torch.maximum(most, second, out=most)
+            p -= rate / young_1 * first / (most.sqrt() / young_2.sqrt() + EPSILON)
