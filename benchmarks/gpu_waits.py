@@ -2,7 +2,9 @@
 
     python benchmarks/gpu_waits.py
 
-Each wait is printed once, with the line that asks for it. One a drawing is known: how many pairs of splat and tile.
+Each wait is printed once, with the line that asks for it. Two are known for all steps of mapping together: how many
+pairs of splat and tile the first of them has, and whether all had room. For the solver's, so are the way there of the
+guess, and back of pose and loss.
 """
 
 import sys
@@ -15,7 +17,7 @@ from tcgsplat.cli.bench.contenders import Ours, Scene
 from tcgsplat.cli.bench.render import Size
 from tcgsplat.render.backends import open_rasterizer
 
-STEPS = 5
+STEPS = 20
 
 
 def main() -> int:

@@ -6,8 +6,8 @@ the place that torch keeps for a backend of one's own, so that it is there on ev
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import torch
@@ -16,6 +16,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
 from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.cuda.launching import Kernels
 from tcgsplat.render.protocol import Raster, Rasterizer, Splats
 from tcgsplat.tensors import Pose
 
@@ -96,12 +97,86 @@ def _performed(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
             return result
         return given[id(result)] if id(result) in given else Elsewhere(result)
 
-    return tree_map(placed, func(*args, **kwargs))
+    return tree_map(placed, _done(func, args, kwargs))
 
 
 def _count(what: str) -> None:
+    if _TAPES:
+        raise RuntimeError(f"not permitted while a graph is recorded: {what}")
     for counter in _COUNTERS:
         counter[what] += 1
+
+
+class _Tape:
+    """What is done while a graph is recorded. To know its results' shapes it is done, and then undone."""
+
+    def __init__(self) -> None:
+        self._entries: list[tuple[Callable[..., Any], Any, Any, Any]] = []
+        self._before: dict[int, tuple[torch.UntypedStorage, torch.UntypedStorage]] = {}
+
+    def do(self, func: Callable[..., Any], args: Any, kwargs: Any) -> Any:
+        for x in tree_leaves((args, kwargs)):
+            if isinstance(x, torch.Tensor):
+                memory = x.untyped_storage()
+                self._before.setdefault(memory.data_ptr(), (memory, memory.clone()))
+        result = func(*args, **kwargs)
+        self._entries.append((func, args, kwargs, result))
+        return result
+
+    def undo(self) -> None:
+        for memory, before in self._before.values():
+            memory.copy_(before)
+
+    def replay(self) -> None:
+        for func, args, kwargs, result in self._entries:
+            again = func(*args, **kwargs)
+            for old, new in zip(tree_leaves(result), tree_leaves(again), strict=True):
+                if isinstance(old, torch.Tensor) and old.data_ptr() != new.data_ptr():
+                    old.copy_(new)
+
+
+_TAPES: list[_Tape] = []
+
+
+def _done(func: Callable[..., Any], args: Any, kwargs: Any) -> Any:
+    return _TAPES[-1].do(func, args, kwargs) if _TAPES else func(*args, **kwargs)
+
+
+class Recording:
+    """A `Recorder` for the pretend device, which is as strict as a graph: only what was launched is launched again, on
+    the same memory, whatever Python knows by then; and nothing may be waited for.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def aside(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def recorded(self, step: Callable[[], None]) -> Callable[[], None]:
+        self.count += 1
+        tape = _Tape()
+        _TAPES.append(tape)
+        try:
+            step()
+        finally:
+            _TAPES.pop()
+            tape.undo()
+        return tape.replay
+
+
+class DistantKernels:
+    """Kernels of the CPU for tensors of the pretend device."""
+
+    def __init__(self, kernels: Kernels) -> None:
+        self._kernels = kernels
+
+    def launch(self, name: str, blocks: int, arguments: Mapping[str, Any]) -> None:
+        def here(x: object) -> object:
+            return x.values if isinstance(x, Elsewhere) else x
+
+        assert not any(isinstance(x, torch.Tensor) and not isinstance(x, Elsewhere) for x in arguments.values())
+        _done(self._kernels.launch, (name, blocks, {key: here(x) for key, x in arguments.items()}), {})
 
 
 @contextmanager
@@ -124,13 +199,13 @@ def _registered() -> torch.library.Library:
         func = getattr(getattr(aten, packet), overload or "default")
 
         def made(*args: Any, device: object = None, pin_memory: object = None, **kwargs: Any) -> torch.Tensor:
-            return Elsewhere(func(*args, **kwargs, device="cpu"))
+            return Elsewhere(_done(func, args, {**kwargs, "device": "cpu"}))
 
         return made
 
     def brought(source: torch.Tensor, target: torch.Tensor, non_blocking: bool = False) -> torch.Tensor:
         assert isinstance(target, Elsewhere) and not isinstance(source, Elsewhere)
-        if not non_blocking:
+        if not non_blocking or _TAPES:
             _count("values were copied from the CPU")
         target.values.copy_(source)
         return target

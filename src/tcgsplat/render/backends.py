@@ -51,8 +51,8 @@ def _on_gpu(name: str) -> Rasterizer:
         from tcgsplat.render.gsplat_cuda import GsplatRasterizer  # noqa: PLC0415  an extra
 
         return GsplatRasterizer(device)
-    from tcgsplat.render.cuda import CudaRasterizer  # noqa: PLC0415  a CPU needs none of it
+    from tcgsplat.render.cuda import CudaRasterizer, Graphs  # noqa: PLC0415  a CPU needs none of it
 
-    rasterizer = CudaRasterizer(device)
+    rasterizer = CudaRasterizer(device, recorder=Graphs(device))
     prove(rasterizer)
     return rasterizer

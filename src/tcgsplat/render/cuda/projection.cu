@@ -191,17 +191,18 @@ struct List {
     const int* rectangles;
     const long long* order;     // [n] Gaussians by depth
     const long long* ends;      // [n] sums of their counts, each one's own included
-    int* tiles;                 // [pairs] in the order of depth
-    int* owners;                // [pairs] the Gaussian of each
-    int n, tiles_x, nowhere;    // the last is behind all tiles
+    int* tiles;                 // [room] in the order of depth; behind all tiles before
+    int* owners;                // [room] the Gaussian of each
+    long long room;             // pairs that there is memory for
+    int n, tiles_x;
 };
 
 KERNEL(list, List) {
     const int slot = blockIdx.x * THREADS + threadIdx.x;
     if (slot >= a.n) return;
     long long at = slot ? a.ends[slot - 1] : 0;
-    const long long end = a.ends[slot];
-    if (at == end) return;
+    const long long end = a.ends[slot] < a.room ? a.ends[slot] : a.room;
+    if (at >= end) return;
     const int owner = (int)a.order[slot];
     const int* rectangle = a.rectangles + 4 * owner;
     float record[6];
@@ -213,8 +214,7 @@ KERNEL(list, List) {
                 a.tiles[at] = y * a.tiles_x + x;
                 a.owners[at++] = owner;
             }
-    // Nothing is left if the two kernels round alike, which no compiler promises.
-    for (; at < end; at++) a.tiles[at] = a.nowhere, a.owners[at] = owner;
+    // Places are left if the two kernels do not round alike, which no compiler promises: they stay behind all tiles.
 }
 
 struct ProjectBackward {
@@ -225,13 +225,14 @@ struct ProjectBackward {
     const float* pose;
     const long long* order;
     const long long* ends;
-    const float* sums;          // [pairs, SUMS] in the order of `list`
+    const float* sums;          // [room, SUMS] in the order of `list`
     float* d_means;
     float* d_quats;
     float* d_scales;
     float* d_opacities;
     float* d_features;          // [n, features]
     float* d_pose;              // [blocks, 16]: twelve sums of each block
+    long long room;
     int n, features;
     Camera camera;
 };
@@ -243,7 +244,7 @@ KERNEL(project_backward, ProjectBackward) {
     float d_pose[16] = {};
     if (slot < a.n) {
         const int i = (int)a.order[slot];
-        const long long first = slot ? a.ends[slot - 1] : 0, end = a.ends[slot];
+        const long long first = slot ? a.ends[slot - 1] : 0, end = a.ends[slot] < a.room ? a.ends[slot] : a.room;
         float m[MOMENTS] = {};
         for (long long pair = first; pair < end; pair++)
 #pragma unroll

@@ -6,7 +6,8 @@ pair gets its own sums over its tile's pixels, and each Gaussian adds up its pai
 added by atomics: the same input gives the same bits.
 """
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from typing import Any
@@ -14,11 +15,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tcgsplat.errors import BackendUnavailableError
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render import conventions
+from tcgsplat.render.cuda import graphs
+from tcgsplat.render.cuda.graphs import Recorder, Room
 from tcgsplat.render.cuda.launching import THREADS, Compiled, Kernels, source
 from tcgsplat.render.protocol import Raster, Splats
+from tcgsplat.render.repetition import Given, Step, each
 from tcgsplat.tensors import Pose
+
+logger = logging.getLogger(__name__)
 
 TILE, RECORD, MOMENTS = 16, 12, 10  # as in the kernels' text
 _CONSTANTS = ("NEAR_PLANE", "MIN_ALPHA", "MIN_TRANSMITTANCE", "BLUR", "PLANE_SOFTENING", "JACOBIAN_MARGIN")
@@ -41,15 +48,22 @@ class CudaRasterizer:
 
     name = "cuda"
 
-    def __init__(self, device: torch.device, kernels: Mapping[int, Kernels] | None = None) -> None:
+    def __init__(
+        self,
+        device: torch.device,
+        kernels: Mapping[int, Kernels] | None = None,
+        recorder: Recorder | None = None,
+    ) -> None:
         """A rasterizer on a GPU; kernels are compiled, or loaded, when something is drawn first.
 
         Args:
             device: Where the splats are, with its index.
             kernels: Compiled elsewhere, by the number of feature channels.
+            recorder: Of steps that are repeated; if left out, they are done one after the other.
         """
         self.device = device
         self._kernels = dict(kernels or {})
+        self._recorder, self._room = recorder, Room(device)
 
     def kernels(self, features: int) -> Kernels:
         """For so many feature channels.
@@ -65,12 +79,33 @@ class CudaRasterizer:
         """See `Rasterizer`; a GPU has no cores to keep free."""
         return nullcontext()
 
+    def repeat(self, step: Step, given: Given, times: int, state: Sequence[Tensor]) -> None:
+        """See `Repeater`."""
+        if self._recorder is None or times < graphs.SHORTEST:
+            each(step, given, times)
+            return
+        before = [table.clone() for table in state]
+
+        def begin_again() -> None:
+            for table, values in zip(state, before, strict=True):
+                table.copy_(values)
+
+        try:
+            graphs.repeat(self._recorder, self._room, step, given, times, begin_again)
+        except torch.OutOfMemoryError:
+            raise
+        except (RuntimeError, BackendUnavailableError) as error:
+            logger.warning("CUDA graphs are not used, which is slower and changes nothing else: %s", error)
+            self._recorder = None
+            begin_again()
+            each(step, given, times)
+
     def __call__(self, splats: Splats, camera: Camera, T_cam_map: Pose) -> Raster:
-        """Draw; see `Rasterizer`. The host waits once: for how many pairs of splat and tile there are."""
+        """Draw; see `Rasterizer`. But in recorded steps, the host waits once: for the number of pairs."""
         c = splats.features.shape[1]
         planes, visible = _Draw.apply(  # type: ignore[no-untyped-call]
-            self.kernels(c), camera, splats.means, splats.quats, splats.scales, splats.opacities, splats.features,
-            T_cam_map,
+            self.kernels(c), camera, self._room, splats.means, splats.quats, splats.scales, splats.opacities,
+            splats.features, T_cam_map,
         )  # fmt: skip
         return Raster(planes[:c].permute(1, 2, 0), planes[c], planes[c + 1], planes[c + 2], visible)
 
@@ -85,7 +120,7 @@ def _tile_bounds(tiles: int, device: torch.device, dtype: torch.dtype) -> Tensor
     return torch.arange(tiles + 1, device=device, dtype=dtype)
 
 
-def _listed(kernels: Kernels, seen: dict[str, Tensor], tiles_x: int, tiles: int) -> dict[str, Tensor]:
+def _listed(kernels: Kernels, seen: dict[str, Tensor], tiles_x: int, tiles: int, room: Room) -> dict[str, Tensor]:
     """The pairs of splat and tile, in the order of depth, and how the tiles have them.
 
     Returns:
@@ -95,19 +130,19 @@ def _listed(kernels: Kernels, seen: dict[str, Tensor], tiles_x: int, tiles: int)
     n, device = len(seen["depths"]), seen["depths"].device
     order = seen["depths"].argsort(stable=True)
     ends = seen["counts"][order].cumsum(0)
-    total = int(ends[-1]) if n else 0  # what the host waits for: it asks for that much memory
-    tile = torch.empty(total, dtype=torch.int32, device=device)
+    pairs = room.asked_for(ends)
+    tile = torch.full((pairs,), tiles, dtype=torch.int32, device=device)
     owners = torch.empty_like(tile)
-    if total:
+    if n and pairs:
         kernels.launch("list", _blocks(n), {
             "records": seen["records"], "rectangles": seen["rectangles"], "order": order, "ends": ends, "tiles": tile,
-            "owners": owners, "n": n, "tiles_x": tiles_x, "nowhere": tiles,
+            "owners": owners, "room": pairs, "n": n, "tiles_x": tiles_x,
         })  # fmt: skip
     if tiles <= torch.iinfo(torch.int16).max:  # sixteen bits are sorted in half the passes
         tile = tile.to(torch.int16)
-    by_tile, pairs = tile.sort(stable=True)
+    by_tile, by_place = tile.sort(stable=True)
     starts = torch.searchsorted(by_tile, _tile_bounds(tiles, device, tile.dtype))
-    return {"order": order, "ends": ends, "owners": owners, "pairs": pairs, "starts": starts}
+    return {"order": order, "ends": ends, "owners": owners, "pairs": by_place, "starts": starts}
 
 
 class _Draw(torch.autograd.Function):
@@ -115,8 +150,8 @@ class _Draw(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, kernels: Kernels, camera: Camera, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor,
-        features: Tensor, T_cam_map: Tensor,
+        ctx: Any, kernels: Kernels, camera: Camera, room: Room, means: Tensor, quats: Tensor, scales: Tensor,
+        opacities: Tensor, features: Tensor, T_cam_map: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         (n, c), device, width, height = features.shape, means.device, camera.width, camera.height
         parameters = {
@@ -134,7 +169,7 @@ class _Draw(torch.autograd.Function):
         }  # fmt: skip
         if n:
             kernels.launch("project", _blocks(n), parameters | seen | {"n": n, "camera": view})
-        listed = _listed(kernels, seen, tiles_x, tiles_x * tiles_y)
+        listed = _listed(kernels, seen, tiles_x, tiles_x * tiles_y, room)
 
         planes, through = means.new_empty(c + 3, height, width), means.new_empty(height, width)
         blended = {
@@ -163,8 +198,8 @@ class _Draw(torch.autograd.Function):
         grads["d_features"] = torch.empty_like(blended["features"])
         d_pose = d_planes.new_zeros(_blocks(n), 16)
         if n:
-            given = projected | {"sums": sums, "features": c}
+            given = projected | {"sums": sums, "features": c, "room": len(sums)}
             kernels.launch("project_backward", _blocks(n), given | grads | {"d_pose": d_pose})
         if not ctx.needs_input_grad[-1]:  # else a pose on the CPU would be waited for
-            return None, None, *grads.values(), None
-        return None, None, *grads.values(), d_pose.sum(dim=0, dtype=torch.float64).view(4, 4).to(ctx.pose_like)
+            return None, None, None, *grads.values(), None
+        return None, None, None, *grads.values(), d_pose.sum(dim=0, dtype=torch.float64).view(4, 4).to(ctx.pose_like)

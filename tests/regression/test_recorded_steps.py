@@ -1,0 +1,186 @@
+"""Steps of mapping and of the paper's solver recorded as a graph: the same bits as one by one, and nothing to wait for.
+
+The device is the pretended one of `elsewhere.py`, whose recordings are as strict as CUDA's; drawn by the GPU's kernels,
+which a CPU runs.
+"""
+
+import logging
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import torch
+from analytic_room import CAMERA, Room, pose
+from emulated_cuda import COMPILER, EmulatedKernels
+
+if torch.cuda.is_available():
+    pytest.skip("torch has room for one device beside the CPU, and a GPU is here", allow_module_level=True)
+if COMPILER is None:
+    pytest.skip("no C++ compiler to emulate with", allow_module_level=True)
+
+from elsewhere import DEVICE, DistantKernels, Recording, counted_waits
+
+from tcgsplat.confidence.state import ConfidenceConfig
+from tcgsplat.geometry import se3
+from tcgsplat.mapping import optimization
+from tcgsplat.mapping.cuda_optimizer import CudaRowAdam, adam_text
+from tcgsplat.mapping.feedback import judged
+from tcgsplat.mapping.mapper import Mapper
+from tcgsplat.mapping.optimization import AutogradOptimization
+from tcgsplat.mapping.seeding import IdSource, SeedingConfig
+from tcgsplat.mapping.settings import MapperConfig
+from tcgsplat.render.cuda import graphs
+from tcgsplat.render.cuda.graphs import Recorder
+from tcgsplat.render.cuda.rasterizer import CudaRasterizer, kernel_text
+from tcgsplat.render.cuda.ssim import similarity, ssim_text
+from tcgsplat.render.losses import SSIM_C1, SSIM_C2, ssim_window
+from tcgsplat.render.ssim_kernels import RADIUS
+from tcgsplat.scene.submap import Keyframe, Submap
+from tcgsplat.tracking.descent import DescentConfig, descend
+
+SMALL = CAMERA.scaled(0.25)
+SURFACE = MapperConfig(
+    seeding=SeedingConfig(recipe="surface", spacing=1, footprint=0.5, opacity=0.9), iterations=4, first_iterations=4
+)
+POINTS = MapperConfig(
+    seeding=SeedingConfig(recipe="points", first_points=800, first_gradient_points=200, points=200),
+    iterations=4, first_iterations=4, isotropy_weight=1.0,
+)  # fmt: skip
+PAPER = ConfidenceConfig(model="paper", guide_mapping=True, stability_weight=10.0, slack_min=0.0, slack_max=1e-4)
+MODELS = pytest.mark.parametrize(
+    ("config", "confidence"), [(SURFACE, ConfidenceConfig()), (POINTS, PAPER)], ids=["ours", "paper"]
+)
+VIEWS = [1, 0, 1, 1, 0, 0, 1]
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Recorder | None], CudaRasterizer]:
+    folder: Path = tmp_path_factory.mktemp("emulated")
+    kernels = {c: DistantKernels(EmulatedKernels(kernel_text(c), folder)) for c in (2, 4)}
+    return lambda recorder: CudaRasterizer(DEVICE, kernels, recorder)
+
+
+@pytest.fixture(autouse=True)
+def all_kernels(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Adam and SSIM by the GPU's kernels too."""
+    folder = tmp_path_factory.getbasetemp()
+    adam = DistantKernels(EmulatedKernels(adam_text(), folder))
+    ssim = DistantKernels(EmulatedKernels(ssim_text(RADIUS, SSIM_C1, SSIM_C2), folder))
+    window = ssim_window().to(DEVICE)
+    monkeypatch.setattr(optimization, "_row_adam", lambda gaussians, rates: CudaRowAdam(gaussians, rates, adam))
+    monkeypatch.setattr(optimization, "ssim_map", lambda a, b: similarity(ssim, a, b, window))
+
+
+def mapped(config: MapperConfig, confidence: ConfidenceConfig, rasterizer: CudaRasterizer) -> Submap:
+    """From two views, the second of which shows more; judged, so that there is something for Eqs. 20 to 24 to do."""
+    mapper = Mapper(config, confidence, rasterizer, IdSource(), torch.Generator().manual_seed(0))
+    submap = Submap.anchored(se3.identity(), 0, config.sh_degree, DEVICE)
+    for index, T in enumerate((pose(), pose(-0.1, 0.05, -0.3, degrees=(0, 14, 0)))):
+        grown = mapper.grown(Keyframe(Room().frame(T, index, camera=SMALL), T), submap)
+        update = mapper.optimized(grown)
+        submap = judged(update, grown.frame, confidence, config.depth_mode)
+    return submap
+
+
+def optimized(
+    submap: Submap, config: MapperConfig, confidence: ConfidenceConfig, rasterizer: CudaRasterizer
+) -> tuple[Submap, float]:
+    update = AutogradOptimization(submap, config, confidence, rasterizer)
+    update.steps(VIEWS[:5], frozen=("sh",))
+    update.prune()
+    update.steps(VIEWS)
+    return update.submap().cpu(), update.loss
+
+
+def assert_same(ours: Submap, expected: Submap) -> None:
+    for field in fields(expected.gaussians):
+        assert torch.equal(getattr(ours.gaussians, field.name), getattr(expected.gaussians, field.name)), field.name
+
+
+@MODELS
+def test_an_update_has_the_same_bits(
+    opened: Callable[[Recorder | None], CudaRasterizer], config: MapperConfig, confidence: ConfidenceConfig
+) -> None:
+    plain, recording = opened(None), Recording()
+    submap = mapped(config, confidence, plain)
+    expected, loss = optimized(submap, config, confidence, plain)
+    ours, recorded_loss = optimized(submap, config, confidence, opened(recording))
+    assert recording.count == 2
+    assert_same(ours, expected)
+    assert recorded_loss == loss
+    moved = (expected.gaussians.means - submap.cpu().gaussians.means[: len(expected)]).abs().max()
+    assert moved > 1e-4  # or all would be the same for nothing
+
+
+@pytest.mark.parametrize("floor", [None, 0.3])
+def test_the_papers_solver_finds_the_same_bits(
+    opened: Callable[[Recorder | None], CudaRasterizer], floor: float | None
+) -> None:
+    plain, recording, guess = opened(None), Recording(), pose(0.01, 0.0, 0.005)
+    submap = mapped(SURFACE, ConfidenceConfig(), plain)
+    frame, config = Room().frame(pose(), camera=SMALL), DescentConfig(iterations=9, rotation_rate=1e-3)
+    expected, ours = (
+        descend(frame, submap, guess, rasterizer, config, floor=floor) for rasterizer in (plain, opened(recording))
+    )
+    assert recording.count == 1
+    assert torch.equal(ours.T_map_cam, expected.T_map_cam)
+    assert ours.loss == expected.loss
+    assert not torch.equal(expected.T_map_cam, guess)
+
+
+def test_steps_that_had_too_little_room_are_done_again(
+    opened: Callable[[Recorder | None], CudaRasterizer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With no room to spare, one view has too little after the other has been drawn."""
+    monkeypatch.setattr(graphs, "SPARE", 1.0)
+    config, confidence, plain, recordings = SURFACE, ConfidenceConfig(), opened(None), []
+    submap = mapped(config, confidence, plain)
+    for views in ([0, 1, 1, 1, 1], [1, 0, 0, 0, 0]):
+        updates, recording = [], Recording()
+        for rasterizer in (plain, opened(recording)):
+            updates.append(AutogradOptimization(submap, config, confidence, rasterizer))
+            updates[-1].steps(views)
+        assert_same(updates[1].submap().cpu(), updates[0].submap().cpu())
+        recordings.append(recording.count)
+    assert max(recordings) > 1
+
+
+def test_the_host_waits_twice_however_many_steps_there_are(
+    opened: Callable[[Recorder | None], CudaRasterizer],
+) -> None:
+    rasterizer, config, confidence = opened(Recording()), SURFACE, ConfidenceConfig()
+    submap = mapped(config, confidence, rasterizer)
+    for times in (4, 12):
+        update = AutogradOptimization(submap, config, confidence, rasterizer)
+        with counted_waits() as waits:
+            update.steps([1] * times)
+        assert waits == {"a number was read": 2}, times
+
+
+class Refusing:
+    """A recorder that fails in the middle of a step."""
+
+    def aside(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def recorded(self, step: Callable[[], None]) -> Callable[[], None]:
+        step()
+        raise RuntimeError("operation not permitted when stream is capturing")
+
+
+def test_what_cannot_be_recorded_is_done_step_by_step(
+    opened: Callable[[Recorder | None], CudaRasterizer], caplog: pytest.LogCaptureFixture
+) -> None:
+    config, confidence, plain, refused = SURFACE, ConfidenceConfig(), opened(None), opened(Refusing())
+    submap = mapped(config, confidence, plain)
+    expected, loss = optimized(submap, config, confidence, plain)
+    with caplog.at_level(logging.WARNING):
+        ours, refused_loss = optimized(submap, config, confidence, refused)
+    assert [record.getMessage() for record in caplog.records] == [
+        "CUDA graphs are not used, which is slower and changes nothing else: operation not permitted when stream is "
+        "capturing"
+    ]
+    assert_same(ours, expected)
+    assert refused_loss == loss
