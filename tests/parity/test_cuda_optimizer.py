@@ -57,7 +57,13 @@ def test_steps_are_those_of_torch(place: tuple[Kernels, torch.device], sh_degree
         for adam, there in zip(adams, (torch.device("cpu"), device), strict=True):
             options = {"gradient_scale": scale.to(there)} if literal else {"step_scale": scale.to(there)}
             frozen, seen = ("sh",) if step < 3 else (), None if visible is None else visible.to(there)
-            adam.step(loss_of(adam.gaussians, step), visible=seen, frozen=frozen, pace=1.0 - 0.05 * step, **options)
+            adam.step(
+                loss_of(adam.gaussians, step),
+                visible=seen,
+                frozen=frozen,
+                pace=torch.tensor(1.0 - 0.05 * step).to(there),
+                **options,
+            )
     keep = torch.rand(N, generator=g) < 0.9
     adams = [adams[0].kept(keep), adams[1].kept(keep.to(device))]
     for step in range(3):

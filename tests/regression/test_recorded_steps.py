@@ -90,7 +90,7 @@ def optimized(
     update = AutogradOptimization(submap, config, confidence, rasterizer)
     update.steps(VIEWS[:5], frozen=("sh",))
     update.prune()
-    update.steps(VIEWS)
+    update.steps(VIEWS, paces=[0.9**k for k in range(len(VIEWS))])
     return update.submap().cpu(), update.loss
 
 

@@ -8,6 +8,7 @@ from analytic_room import CAMERA, Room, pose
 
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
+from tcgsplat.mapping import refinement
 from tcgsplat.mapping.mapper import Mapper
 from tcgsplat.mapping.refinement import for_seconds, for_steps, refined
 from tcgsplat.mapping.seeding import IdSource
@@ -68,6 +69,25 @@ def test_every_keyframe_is_seen_before_any_is_seen_again(submap: Submap, rasteri
         moved = (after.gaussians.means != submap.gaussians.means).any(dim=1)
         for T_map_cam in POSES:
             assert moved[render_view(submap, CAMERA, T_map_cam, rasterizer).visible].float().mean() > 0.99
+
+
+def test_so_many_steps_are_taken_at_their_paces(
+    submap: Submap, rasterizer: Rasterizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the number that is taken in one go."""
+    asked: list[int] = []
+
+    def effort(steps: int) -> float:
+        asked.append(steps)
+        return for_steps(20)(steps)
+
+    found = []
+    for at_once in (1, 3, 16, 50):
+        monkeypatch.setattr(refinement, "AT_ONCE", at_once)
+        after = refined(submap, CONFIG, CONFIDENCE, rasterizer, torch.Generator().manual_seed(0), effort)
+        found.append(after.gaussians.means)
+        assert asked[-1] == max(asked) == 20
+    assert all(torch.equal(means, found[0]) for means in found)
 
 
 def test_time_ends_it_too(submap: Submap, rasterizer: Rasterizer) -> None:

@@ -9,6 +9,7 @@ struct Adam {
     const unsigned char* visible;   // [n] rows that take part; null for all
     const float* gradient_scale;    // [n] or null
     const float* step_scale;        // [n] or null
+    const float* pace;              // factor on the rates
     int n, width;
     int head;                       // of a row, entries with the full rate
     float rate, tail_rate;
@@ -27,5 +28,5 @@ KERNEL(adam, Adam) {
     const float young_1 = -expm1f(steps * LOG_BETA_1), young_2 = -expm1f(steps * LOG_BETA_2);
     float step = first / young_1 / (sqrtf(second / young_2) + EPSILON);
     if (a.step_scale) step *= a.step_scale[row];
-    a.parameters[at] -= (at % a.width < a.head ? a.rate : a.tail_rate) * step;
+    a.parameters[at] -= *a.pace * (at % a.width < a.head ? a.rate : a.tail_rate) * step;
 }

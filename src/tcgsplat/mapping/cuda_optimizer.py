@@ -41,11 +41,11 @@ class CudaRowAdam(RowAdam):
         name: str,
         gradient: Tensor,
         visible: PerGaussianFlag | None,
-        pace: float,
+        pace: Tensor,
         gradient_scale: PerGaussian | None,
         step_scale: PerGaussian | None,
     ) -> None:
-        table, steps, rate = self._parameters[name], self._steps[name], pace * getattr(self._rates, name)
+        table, steps, rate = self._parameters[name], self._steps[name], getattr(self._rates, name)
         if not table.numel():
             return
         steps += 1 if visible is None else visible
@@ -53,8 +53,8 @@ class CudaRowAdam(RowAdam):
         self._kernels.launch("adam", -(-n * width // THREADS), {
             "parameters": table, "gradient": gradient.contiguous(), "first": self._first[name],
             "second": self._second[name], "steps": steps, "visible": visible, "gradient_scale": gradient_scale,
-            "step_scale": step_scale, "n": n, "width": width, "head": 3 if name == "sh" else width, "rate": rate,
-            "tail_rate": HIGHER_HARMONICS * rate,
+            "step_scale": step_scale, "pace": pace, "n": n, "width": width, "head": 3 if name == "sh" else width,
+            "rate": rate, "tail_rate": HIGHER_HARMONICS * rate,
         })  # fmt: skip
 
     def _of(self, gaussians: Gaussians) -> "CudaRowAdam":

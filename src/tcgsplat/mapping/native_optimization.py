@@ -91,10 +91,10 @@ class NativeOptimization:
         self._window = ssim_window().numpy()
         self._space = Workspace()
 
-    def steps(self, views: Sequence[int], frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
+    def steps(self, views: Sequence[int], frozen: tuple[str, ...] = (), paces: Sequence[float] | None = None) -> None:
         """See `Optimization`."""
         assert not frozen  # `covers` keeps such settings away
-        for view in views:
+        for view, pace in zip(views, paces or [1.0] * len(views), strict=True):
             self._step(self._view(view), pace)
 
     def _step(self, target: _View, pace: float) -> None:

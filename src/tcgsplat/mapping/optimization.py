@@ -29,10 +29,10 @@ from tcgsplat.tensors import PerGaussian, PerGaussianFlag, Pose
 class Optimization(Protocol):
     """A submap while it is optimised: mutable, made for one mapping update, dropped after it."""
 
-    def steps(self, views: Sequence[int], frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
+    def steps(self, views: Sequence[int], frozen: tuple[str, ...] = (), paces: Sequence[float] | None = None) -> None:
         """At one keyframe after the other follow the gradient of Eq. 21 by one Adam step of every Gaussian in view.
 
-        Parameters named in `frozen` stay; `pace` multiplies the learning rates.
+        Parameters named in `frozen` stay; `paces` are factors on the learning rates, one for each step.
         """
         ...
 
@@ -79,22 +79,26 @@ class AutogradOptimization:
         inverses = [se3.inverse(keyframe.T_map_cam) for keyframe in submap.keyframes]
         self._T_cam_map = torch.stack(inverses).to(rasterizer.device) if inverses else None
 
-    def steps(self, views: Sequence[int], frozen: tuple[str, ...] = (), pace: float = 1.0) -> None:
+    def steps(self, views: Sequence[int], frozen: tuple[str, ...] = (), paces: Sequence[float] | None = None) -> None:
         """See `Optimization`; all keyframes have the first one's camera."""
         keyframes, poses, device = self._submap.keyframes, self._T_cam_map, self._rasterizer.device
         assert poses is not None
+        pace = torch.ones(len(views)) if paces is None else torch.tensor(paces, dtype=torch.float32)
+        pace = pace.to(device, non_blocking=True)
 
         def given(k: int) -> tuple[torch.Tensor, ...]:
             frame = keyframes[views[k]].to(device).balanced
-            return frame.color, frame.depth, frame.valid, poses[views[k]]
+            return frame.color, frame.depth, frame.valid, poses[views[k]], pace[k]
 
-        def step(color: torch.Tensor, depth: torch.Tensor, valid: torch.Tensor, T_cam_map: Pose) -> None:
+        def step(
+            color: torch.Tensor, depth: torch.Tensor, valid: torch.Tensor, T_cam_map: Pose, pace: torch.Tensor
+        ) -> None:
             frame = Frame(0, 0.0, color, depth, valid, keyframes[0].frame.camera)
             self._step(frame, T_cam_map, frozen, pace)
 
         repeat(self._rasterizer, step, given, len(views), [*self._adam.tables, self._loss_value])
 
-    def _step(self, frame: Frame, T_cam_map: Pose, frozen: tuple[str, ...], pace: float) -> None:
+    def _step(self, frame: Frame, T_cam_map: Pose, frozen: tuple[str, ...], pace: torch.Tensor) -> None:
         gaussians = self._adam.gaussians
         rendering = render(gaussians, self._submap.confidence.value, frame.camera, T_cam_map, self._rasterizer)
         loss = self._loss(rendering, frame, gaussians, self._before, self._submap)

@@ -106,7 +106,7 @@ class RowAdam:
         loss: Tensor,
         visible: PerGaussianFlag | None = None,
         frozen: tuple[str, ...] = (),
-        pace: float = 1.0,
+        pace: Tensor | None = None,
         gradient_scale: PerGaussian | None = None,
         step_scale: PerGaussian | None = None,
     ) -> None:
@@ -117,10 +117,11 @@ class RowAdam:
             visible: Rows that take part; the others stay, and so do their moments and their count of steps. None
                 for all.
             frozen: Names of parameters that stay.
-            pace: Factor on all learning rates.
+            pace: Factor on all learning rates, [], float32; 1 if left out.
             gradient_scale: Eq. 24 to the letter: multiplies the geometry's gradients.
             step_scale: Eq. 24 as it is meant: multiplies the geometry's steps.
         """
+        pace = torch.ones((), device=loss.device) if pace is None else pace
         active = [name for name in PARAMETERS if name not in frozen]
         gradients = torch.autograd.grad(loss, [self._parameters[name] for name in active], allow_unused=True)
         for name, gradient in zip(active, gradients, strict=True):
@@ -134,7 +135,7 @@ class RowAdam:
         name: str,
         gradient: Tensor,
         visible: PerGaussianFlag | None,
-        pace: float,
+        pace: Tensor,
         gradient_scale: PerGaussian | None,
         step_scale: PerGaussian | None,
     ) -> None:

@@ -15,6 +15,8 @@ from tcgsplat.scene.submap import Submap
 LAST_PACE = 0.05
 """Learning rates at the end, of those at the beginning: they fall evenly in the logarithm, so that what was found
 roughly settles finely."""
+AT_ONCE = 16
+"""Steps between two looks at the clock: a GPU does as many in one go, a CPU takes some tenths of a second for them."""
 
 
 def refined(
@@ -44,12 +46,22 @@ def refined(
     optimization = begin(submap, config, replace(confidence, stability_weight=0.0), rasterizer)
     order: list[int] = []
     steps = 0
-    while (done := progress(steps)) < 1:
-        order = order or torch.randperm(len(submap.keyframes), generator=generator).tolist()
-        optimization.steps([order.pop()], pace=LAST_PACE**done)
-        steps += 1
+    while paces := _paces(progress, steps):
+        while len(order) < len(paces):
+            order = torch.randperm(len(submap.keyframes), generator=generator).tolist() + order
+        views = [order.pop() for _ in paces]
+        optimization.steps(views, paces=paces)
+        steps += len(paces)
     optimization.prune()
     return optimization.submap().to(submap.device)
+
+
+def _paces(progress: Callable[[int], float], steps: int) -> list[float]:
+    """Of the next steps, as many as are taken in one go; none at the end."""
+    paces: list[float] = []
+    while len(paces) < AT_ONCE and (done := progress(steps + len(paces))) < 1:
+        paces.append(LAST_PACE**done)
+    return paces
 
 
 def for_seconds(seconds: float) -> Callable[[int], float]:

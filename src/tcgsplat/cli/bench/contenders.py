@@ -100,7 +100,7 @@ class Ours:
 
     def map(self, steps: int) -> object:
         """See `Contender`."""
-        self._optimization.steps([0] * steps, pace=0.0)
+        self._optimization.steps([0] * steps, paces=[0.0] * steps)
         return self._optimization
 
 
