@@ -164,6 +164,9 @@ class Recording:
             tape.undo()
         return tape.replay
 
+    def forget(self) -> None:
+        pass
+
 
 class DistantKernels:
     """Kernels of the CPU for tensors of the pretend device."""

@@ -162,25 +162,42 @@ def test_the_host_waits_twice_however_many_steps_there_are(
 class Refusing:
     """A recorder that fails in the middle of a step."""
 
+    def __init__(self, error: Exception) -> None:
+        self._error, self.forgot = error, 0
+
     def aside(self) -> AbstractContextManager[None]:
         return nullcontext()
 
     def recorded(self, step: Callable[[], None]) -> Callable[[], None]:
         step()
-        raise RuntimeError("operation not permitted when stream is capturing")
+        try:
+            raise self._error
+        finally:
+            if not isinstance(self._error, torch.OutOfMemoryError):
+                raise RuntimeError("operation failed due to a previous error during capture")
+
+    def forget(self) -> None:
+        self.forgot += 1
 
 
 def test_what_cannot_be_recorded_is_done_step_by_step(
     opened: Callable[[Recorder | None], CudaRasterizer], caplog: pytest.LogCaptureFixture
 ) -> None:
-    config, confidence, plain, refused = SURFACE, ConfidenceConfig(), opened(None), opened(Refusing())
+    """Said once, with what went wrong first, where it will go wrong again; tried again where memory was too little."""
+    config, confidence, plain = SURFACE, ConfidenceConfig(), opened(None)
     submap = mapped(config, confidence, plain)
     expected, loss = optimized(submap, config, confidence, plain)
-    with caplog.at_level(logging.WARNING):
-        ours, refused_loss = optimized(submap, config, confidence, refused)
-    assert [record.getMessage() for record in caplog.records] == [
+    said = [
         "CUDA graphs are not used, which is slower and changes nothing else: operation not permitted when stream is "
         "capturing"
     ]
-    assert_same(ours, expected)
-    assert refused_loss == loss
+    forbidden = RuntimeError("operation not permitted when stream is capturing")
+    for error, lines, forgot in ((forbidden, said, 0), (torch.OutOfMemoryError(), [], 2)):
+        refusing = Refusing(error)
+        with caplog.at_level(logging.WARNING):
+            ours, refused_loss = optimized(submap, config, confidence, opened(refusing))
+        assert [record.getMessage() for record in caplog.records] == lines
+        assert refusing.forgot == forgot
+        assert_same(ours, expected)
+        assert refused_loss == loss
+        caplog.clear()

@@ -44,17 +44,17 @@ def test_no_limit_limits_nothing():
 
 
 def test_memory_is_shared_out_by_hand():
-    free = 4 * 2**30 - 600 * 2**20 - 1400 * 640 * 480
-    row = 28 * ((3 + 3 + 4 + 1 + 3) * 4 + 8 + 4 * 4 + 2 * 8)
+    free = 4 * 2**30 - 600 * 2**20 - 2200 * 640 * 480
+    row = 48 * ((3 + 3 + 4 + 1 + 3) * 4 + 8 + 4 * 4 + 2 * 8)
     assert MemoryLimit(4.0).gaussians(VGA, 0) == free // row
-    assert MemoryLimit(4.0).pictures(VGA, 0, 1_000_000) == (free - 1_000_000 * row) // (2 * 17 * 640 * 480)
-    assert MemoryLimit(4.0).gaussians(VGA, 3) == free // (row + 28 * 4 * 45)
+    assert MemoryLimit(4.0).pictures(VGA, 0, 400_000) == (free - 400_000 * row) // (2 * 17 * 640 * 480)
+    assert MemoryLimit(4.0).gaussians(VGA, 3) == free // (row + 48 * 4 * 45)
 
 
 def test_a_row_is_what_the_tables_hold():
     submap = Submap.anchored(se3.identity(), 0, sh_degree=2)
     tables = (*vars(submap.gaussians).values(), *vars(submap.confidence).values())
-    assert memory._working_bytes(2) == 28 * sum(t[:0].new_zeros(1, *t.shape[1:]).nbytes for t in tables)
+    assert memory._working_bytes(2) == 48 * sum(t[:0].new_zeros(1, *t.shape[1:]).nbytes for t in tables)
 
 
 def test_a_small_limit_leaves_a_map_and_a_picture():

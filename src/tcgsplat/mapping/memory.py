@@ -15,15 +15,16 @@ from tcgsplat.tensors import PerGaussianFlag
 BYTES_PER_GB = 2**30
 OVERHEAD = 600 * 2**20
 """Bytes that CUDA, torch and the kernels take before anything is drawn. Assumed, not measured."""
-WORKING_BYTES_PER_PIXEL = 1400
+WORKING_BYTES_PER_PIXEL = 2200
 """Of the images while one frame is tracked and another mapped: channels, losses, and the derivatives of both. Torch's
-tensors were counted on a pretend device, 399 for mapping, once more for its step as it is recorded, and 106 for
-tracking; rasterizer and allocator need the rest."""
-WORKING_COPIES = 28
+tensors were counted on a pretend device, 106 for tracking and 399 for mapping: once for the step that is done before
+one is recorded, and twice for the recorded one, whose pool may be twice what it needs (`render/cuda/graphs.py`).
+Rasterizer and allocator need the rest."""
+WORKING_COPIES = 48
 """Of a Gaussian's own 96 bytes (more with harmonics) during an update. Counted likewise, it takes 465 with Adam's
 tables and all gradients, and tracking 34. Then there are the submap before and up to two in loop closure, 128 each, and
-of `render.cuda` some 200 and 100 for each tile: about fifteen copies. To record its steps, an update keeps Adam's
-tables as they were, 190, and draws once more, with half as much room again for tiles: eight more. What the allocator
+of `render.cuda` some 200 and 100 for each tile: about fifteen copies. Adam's tables as they were before, and what a
+step makes of tensors twice more, with half as much room again for tiles, are another twenty-six. What the allocator
 cannot use comes on top."""
 IMAGE_BYTES = 3 * 4 + 4 + 1
 """Of a pixel of a keyframe: colour, depth, whether it is valid."""

@@ -76,19 +76,17 @@ class AutogradOptimization:
         self._before = self._submap.gaussians
         self._adam = _row_adam(self._before, config.rates)
         self._loss_value = torch.zeros((), dtype=torch.float64, device=rasterizer.device)
-        inverses = [se3.inverse(keyframe.T_map_cam) for keyframe in submap.keyframes]
-        self._T_cam_map = torch.stack(inverses).to(rasterizer.device) if inverses else None
 
     def steps(self, views: Sequence[int], frozen: tuple[str, ...] = (), paces: Sequence[float] | None = None) -> None:
         """See `Optimization`; all keyframes have the first one's camera."""
-        keyframes, poses, device = self._submap.keyframes, self._T_cam_map, self._rasterizer.device
-        assert poses is not None
+        keyframes, device = self._submap.keyframes, self._rasterizer.device
+        poses = torch.stack([se3.inverse(keyframes[view].T_map_cam) for view in views])
         pace = torch.ones(len(views)) if paces is None else torch.tensor(paces, dtype=torch.float32)
-        pace = pace.to(device, non_blocking=True)
+        poses, pace = (table.to(device, non_blocking=True) for table in (poses, pace))
 
         def given(k: int) -> tuple[torch.Tensor, ...]:
             frame = keyframes[views[k]].to(device).balanced
-            return frame.color, frame.depth, frame.valid, poses[views[k]], pace[k]
+            return frame.color, frame.depth, frame.valid, poses[k], pace[k]
 
         def step(
             color: torch.Tensor, depth: torch.Tensor, valid: torch.Tensor, T_cam_map: Pose, pace: torch.Tensor

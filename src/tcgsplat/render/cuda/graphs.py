@@ -8,7 +8,7 @@ little, all steps are done again, from where they began, with more. What fits is
 import logging
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from typing import Final, Protocol, runtime_checkable
 
@@ -64,12 +64,21 @@ class Recorder(Protocol):
         ...
 
     def recorded(self, step: Callable[[], None]) -> Callable[[], None]:
-        """A step, without doing it; what is given back does it."""
+        """A step, without doing it; what is given back does it, until the next one is recorded."""
+        ...
+
+    def forget(self) -> None:
+        """Give back the memory of what was recorded."""
         ...
 
 
 class Graphs(threading.local):
-    """CUDA graphs, each thread's on a stream of its own."""
+    """CUDA graphs, each thread's on a stream of its own.
+
+    All of a thread's take their tensors from one pool of memory, which lives as long as the latest of them. What does
+    not fit into the pieces that it has makes it grow, so of maps that grow it would keep pieces of all sizes: when it
+    has become twice as large as it began, another one is begun.
+    """
 
     _one_at_a_time = threading.Lock()  # torch records one in a process
 
@@ -77,6 +86,7 @@ class Graphs(threading.local):
         self._device = device
         self._stream: torch.cuda.Stream | None = None
         self._latest: torch.cuda.CUDAGraph | None = None
+        self._held = self._held_first = 0  # bytes of the pool
 
     @contextmanager
     def aside(self) -> Iterator[None]:
@@ -85,23 +95,46 @@ class Graphs(threading.local):
             self._stream = torch.cuda.Stream(self._device)  # type: ignore[no-untyped-call]
         current = torch.cuda.current_stream(self._device)
         self._stream.wait_stream(current)
-        with torch.cuda.stream(self._stream):
-            yield
-        current.wait_stream(self._stream)
+        try:
+            with torch.cuda.stream(self._stream):
+                yield
+        finally:
+            current.wait_stream(self._stream)
 
     def recorded(self, step: Callable[[], None]) -> Callable[[], None]:
-        """See `Recorder`. Its memory is that of the graph before, which must not be launched any more."""
+        """See `Recorder`."""
+        if self._held > 2 * self._held_first:
+            self.forget()
         graph = torch.cuda.CUDAGraph()
-        # A pool of memory goes when its last graph does, so the one before is kept until here.
-        pool = None if self._latest is None else self._latest.pool()
         with self._one_at_a_time, self.aside():
+            pool = torch.cuda.graph_pool_handle() if self._latest is None else self._latest.pool()
+            before = torch.cuda.memory_reserved(self._device)
             graph.capture_begin(pool, capture_error_mode="thread_local")
             try:
                 step()
             finally:
-                graph.capture_end()
-        self._latest = graph
+                self._end(graph, pool)
+            self._held += torch.cuda.memory_reserved(self._device) - before
+            if self._latest is None:
+                self._held_first = self._held
+            self._latest = graph  # the one before goes here, not while another thread records
         return graph.replay
+
+    def forget(self) -> None:
+        """See `Recorder`."""
+        with self._one_at_a_time:
+            self._latest, self._held, self._held_first = None, 0, 0
+            torch.cuda.empty_cache()
+
+    def _end(self, graph: torch.cuda.CUDAGraph, pool: tuple[int, int]) -> None:
+        """End recording. If that fails, torch leaves the pool open, and would find no memory elsewhere from then on."""
+        try:
+            graph.capture_end()
+        except RuntimeError:
+            for close in ("_cuda_endAllocateToPool", "_cuda_releasePool"):
+                with suppress(RuntimeError, AttributeError):
+                    getattr(torch._C, close)(self._device.index, pool)
+            raise
 
 
 def repeat(

@@ -9,7 +9,6 @@ added by atomics: the same input gives the same bits.
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import cache
 from typing import Any
 
 import torch
@@ -81,24 +80,33 @@ class CudaRasterizer:
 
     def repeat(self, step: Step, given: Given, times: int, state: Sequence[Tensor]) -> None:
         """See `Repeater`."""
-        if self._recorder is None or times < graphs.SHORTEST:
+        recorder = self._recorder  # once: another thread may find out that nothing can be recorded
+        if recorder is None or times < graphs.SHORTEST or not self._repeated(recorder, step, given, times, state):
             each(step, given, times)
-            return
-        before = [table.clone() for table in state]
+
+    def _repeated(self, recorder: Recorder, step: Step, given: Given, times: int, state: Sequence[Tensor]) -> bool:
+        """Whether that could be done by recording; if not, all is as it was."""
+        before: list[Tensor] = []
 
         def begin_again() -> None:
             for table, values in zip(state, before, strict=True):
                 table.copy_(values)
 
         try:
-            graphs.repeat(self._recorder, self._room, step, given, times, begin_again)
+            before += [table.clone() for table in state]
+            graphs.repeat(recorder, self._room, step, given, times, begin_again)
         except torch.OutOfMemoryError:
-            raise
+            logger.debug("too little memory for recording %d steps: they are done one by one", times)
+            recorder.forget()
         except (RuntimeError, BackendUnavailableError) as error:
-            logger.warning("CUDA graphs are not used, which is slower and changes nothing else: %s", error)
+            said = error.__context__ or error  # what ends a recording that has failed tells nothing
+            logger.warning("CUDA graphs are not used, which is slower and changes nothing else: %s", said)
             self._recorder = None
+        else:
+            return True
+        if before:
             begin_again()
-            each(step, given, times)
+        return False
 
     def __call__(self, splats: Splats, camera: Camera, T_cam_map: Pose) -> Raster:
         """Draw; see `Rasterizer`. But in recorded steps, the host waits once: for the number of pairs."""
@@ -113,11 +121,6 @@ class CudaRasterizer:
 def _blocks(n: int) -> int:
     """That give each of n things a thread."""
     return -(-n // THREADS)
-
-
-@cache
-def _tile_bounds(tiles: int, device: torch.device, dtype: torch.dtype) -> Tensor:
-    return torch.arange(tiles + 1, device=device, dtype=dtype)
 
 
 def _listed(kernels: Kernels, seen: dict[str, Tensor], tiles_x: int, tiles: int, room: Room) -> dict[str, Tensor]:
@@ -141,7 +144,7 @@ def _listed(kernels: Kernels, seen: dict[str, Tensor], tiles_x: int, tiles: int,
     if tiles <= torch.iinfo(torch.int16).max:  # sixteen bits are sorted in half the passes
         tile = tile.to(torch.int16)
     by_tile, by_place = tile.sort(stable=True)
-    starts = torch.searchsorted(by_tile, _tile_bounds(tiles, device, tile.dtype))
+    starts = torch.searchsorted(by_tile, torch.arange(tiles + 1, device=device, dtype=tile.dtype))
     return {"order": order, "ends": ends, "owners": owners, "pairs": by_place, "starts": starts}
 
 
