@@ -192,7 +192,7 @@ def test_what_cannot_be_recorded_is_done_step_by_step(
         "capturing"
     ]
     forbidden = RuntimeError("operation not permitted when stream is capturing")
-    for error, lines, forgot in ((forbidden, said, 0), (torch.OutOfMemoryError(), [], 2)):
+    for error, lines, forgot in ((forbidden, said, 1), (torch.OutOfMemoryError(), [], 2)):
         refusing = Refusing(error)
         with caplog.at_level(logging.WARNING):
             ours, refused_loss = optimized(submap, config, confidence, opened(refusing))

@@ -162,4 +162,5 @@ def repeat(
             return
         logger.debug("%d pairs of splat and tile, room for %d: %d steps once more", wanted, pairs, times)
         start = 0
+        del again  # so that its graph goes where the recorder lets it go
         begin_again()

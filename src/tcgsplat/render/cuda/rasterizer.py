@@ -95,15 +95,15 @@ class CudaRasterizer:
         try:
             before += [table.clone() for table in state]
             graphs.repeat(recorder, self._room, step, given, times, begin_again)
+            return True
         except torch.OutOfMemoryError:
             logger.debug("too little memory for recording %d steps: they are done one by one", times)
-            recorder.forget()
         except (RuntimeError, BackendUnavailableError) as error:
             said = error.__context__ or error  # what ends a recording that has failed tells nothing
             logger.warning("CUDA graphs are not used, which is slower and changes nothing else: %s", said)
             self._recorder = None
-        else:
-            return True
+        # Here, where the error no longer keeps what the step had made.
+        recorder.forget()
         if before:
             begin_again()
         return False
