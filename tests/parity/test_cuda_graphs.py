@@ -4,20 +4,16 @@ The pool of memory, the streams and what may be recorded at all are torch's and 
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
 
 import pytest
 import torch
 from analytic_room import Room, pose
+from twice_mapped import assert_same, twice_mapped
 
 from tcgsplat.config import SlamConfig
-from tcgsplat.geometry import se3
-from tcgsplat.mapping.feedback import judged
-from tcgsplat.mapping.mapper import Mapper
 from tcgsplat.mapping.optimization import AutogradOptimization
-from tcgsplat.mapping.seeding import IdSource
 from tcgsplat.render.cuda import CudaRasterizer, Graphs
-from tcgsplat.scene.submap import Keyframe, Submap
+from tcgsplat.scene.submap import Submap
 from tcgsplat.tracking.descent import Descent, DescentConfig, descend
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU")
@@ -30,14 +26,7 @@ def device() -> torch.device:
 
 
 def mapped() -> Submap:
-    mapper = Mapper(
-        CONFIG.mapper, CONFIG.confidence, CudaRasterizer(device()), IdSource(), torch.Generator().manual_seed(0)
-    )
-    submap = Submap.anchored(se3.identity(), 0, 0, device())
-    for index, T in enumerate((pose(), pose(-0.1, 0.05, -0.3, degrees=(0, 14, 0)))):
-        grown = mapper.grown(Keyframe(Room().frame(T, index), T), submap)
-        submap = judged(mapper.optimized(grown), grown.frame, CONFIG.confidence, CONFIG.mapper.depth_mode)
-    return submap
+    return twice_mapped(CONFIG.mapper, CONFIG.confidence, CudaRasterizer(device()))
 
 
 def optimized(submap: Submap, rasterizer: CudaRasterizer) -> tuple[Submap, float]:
@@ -51,11 +40,6 @@ def optimized(submap: Submap, rasterizer: CudaRasterizer) -> tuple[Submap, float
 def found(submap: Submap, rasterizer: CudaRasterizer) -> Descent:
     config = DescentConfig(iterations=20, rotation_rate=1e-3)
     return descend(Room().frame(pose()), submap, pose(0.01, 0.0, 0.005), rasterizer, config, floor=0.3)
-
-
-def assert_same(ours: Submap, expected: Submap) -> None:
-    for field in fields(expected.gaussians):
-        assert torch.equal(getattr(ours.gaussians, field.name), getattr(expected.gaussians, field.name)), field.name
 
 
 def test_recorded_steps_have_the_same_bits(caplog: pytest.LogCaptureFixture) -> None:

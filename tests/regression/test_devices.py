@@ -4,7 +4,7 @@ The device is the pretended one of `elsewhere.py`; where a real one is, `tests/p
 """
 
 import shutil
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ if torch.cuda.is_available():
     pytest.skip("torch has room for one device beside the CPU, and a GPU is here", allow_module_level=True)
 
 from elsewhere import DEVICE, Distant, Near, counted_waits
+from twice_mapped import assert_same
 
 from tcgsplat.cli.bench import confidence as confidence_bench
 from tcgsplat.cli.bench import track as track_bench
@@ -84,14 +85,6 @@ def there(submap: Submap) -> Submap:
 def one_ssim(monkeypatch: pytest.MonkeyPatch) -> None:
     """On the CPU, too, SSIM in torch: its kernels round otherwise, and nothing else does."""
     monkeypatch.setattr(optimization, "ssim_map", plain_ssim_map)
-
-
-def assert_same(ours: Submap, expected: Submap) -> None:
-    """To the bit."""
-    ours = ours.cpu()
-    for table, other in ((ours.gaussians, expected.gaussians), (ours.confidence, expected.confidence)):
-        for field in fields(table):
-            assert torch.equal(getattr(table, field.name), getattr(other, field.name)), field.name
 
 
 def test_the_pretended_device_refuses_what_a_gpu_refuses() -> None:

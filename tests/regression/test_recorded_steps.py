@@ -7,7 +7,6 @@ which a CPU runs.
 import logging
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -21,15 +20,13 @@ if COMPILER is None:
     pytest.skip("no C++ compiler to emulate with", allow_module_level=True)
 
 from elsewhere import DEVICE, DistantKernels, Recording, counted_waits
+from twice_mapped import assert_same, twice_mapped
 
 from tcgsplat.confidence.state import ConfidenceConfig
-from tcgsplat.geometry import se3
 from tcgsplat.mapping import optimization
 from tcgsplat.mapping.cuda_optimizer import CudaRowAdam, adam_text
-from tcgsplat.mapping.feedback import judged
-from tcgsplat.mapping.mapper import Mapper
 from tcgsplat.mapping.optimization import AutogradOptimization
-from tcgsplat.mapping.seeding import IdSource, SeedingConfig
+from tcgsplat.mapping.seeding import SeedingConfig
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.cuda import graphs
 from tcgsplat.render.cuda.graphs import Recorder
@@ -37,7 +34,7 @@ from tcgsplat.render.cuda.rasterizer import CudaRasterizer, kernel_text
 from tcgsplat.render.cuda.ssim import similarity, ssim_text
 from tcgsplat.render.losses import SSIM_C1, SSIM_C2, ssim_window
 from tcgsplat.render.ssim_kernels import RADIUS
-from tcgsplat.scene.submap import Keyframe, Submap
+from tcgsplat.scene.submap import Submap
 from tcgsplat.tracking.descent import DescentConfig, descend
 
 SMALL = CAMERA.scaled(0.25)
@@ -73,17 +70,6 @@ def all_kernels(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPa
     monkeypatch.setattr(optimization, "ssim_map", lambda a, b: similarity(ssim, a, b, window))
 
 
-def mapped(config: MapperConfig, confidence: ConfidenceConfig, rasterizer: CudaRasterizer) -> Submap:
-    """From two views, the second of which shows more; judged, so that there is something for Eqs. 20 to 24 to do."""
-    mapper = Mapper(config, confidence, rasterizer, IdSource(), torch.Generator().manual_seed(0))
-    submap = Submap.anchored(se3.identity(), 0, config.sh_degree, DEVICE)
-    for index, T in enumerate((pose(), pose(-0.1, 0.05, -0.3, degrees=(0, 14, 0)))):
-        grown = mapper.grown(Keyframe(Room().frame(T, index, camera=SMALL), T), submap)
-        update = mapper.optimized(grown)
-        submap = judged(update, grown.frame, confidence, config.depth_mode)
-    return submap
-
-
 def optimized(
     submap: Submap, config: MapperConfig, confidence: ConfidenceConfig, rasterizer: CudaRasterizer
 ) -> tuple[Submap, float]:
@@ -94,17 +80,12 @@ def optimized(
     return update.submap().cpu(), update.loss
 
 
-def assert_same(ours: Submap, expected: Submap) -> None:
-    for field in fields(expected.gaussians):
-        assert torch.equal(getattr(ours.gaussians, field.name), getattr(expected.gaussians, field.name)), field.name
-
-
 @MODELS
 def test_an_update_has_the_same_bits(
     opened: Callable[[Recorder | None], CudaRasterizer], config: MapperConfig, confidence: ConfidenceConfig
 ) -> None:
     plain, recording = opened(None), Recording()
-    submap = mapped(config, confidence, plain)
+    submap = twice_mapped(config, confidence, plain, SMALL)
     expected, loss = optimized(submap, config, confidence, plain)
     ours, recorded_loss = optimized(submap, config, confidence, opened(recording))
     assert recording.count == 2
@@ -119,7 +100,7 @@ def test_the_papers_solver_finds_the_same_bits(
     opened: Callable[[Recorder | None], CudaRasterizer], floor: float | None
 ) -> None:
     plain, recording, guess = opened(None), Recording(), pose(0.01, 0.0, 0.005)
-    submap = mapped(SURFACE, ConfidenceConfig(), plain)
+    submap = twice_mapped(SURFACE, ConfidenceConfig(), plain, SMALL)
     frame, config = Room().frame(pose(), camera=SMALL), DescentConfig(iterations=9, rotation_rate=1e-3)
     expected, ours = (
         descend(frame, submap, guess, rasterizer, config, floor=floor) for rasterizer in (plain, opened(recording))
@@ -136,7 +117,7 @@ def test_steps_that_had_too_little_room_are_done_again(
     """With no room to spare, one view has too little after the other has been drawn."""
     monkeypatch.setattr(graphs, "SPARE", 1.0)
     config, confidence, plain, recordings = SURFACE, ConfidenceConfig(), opened(None), []
-    submap = mapped(config, confidence, plain)
+    submap = twice_mapped(config, confidence, plain, SMALL)
     for views in ([0, 1, 1, 1, 1], [1, 0, 0, 0, 0]):
         updates, recording = [], Recording()
         for rasterizer in (plain, opened(recording)):
@@ -151,7 +132,7 @@ def test_the_host_waits_twice_however_many_steps_there_are(
     opened: Callable[[Recorder | None], CudaRasterizer],
 ) -> None:
     rasterizer, config, confidence = opened(Recording()), SURFACE, ConfidenceConfig()
-    submap = mapped(config, confidence, rasterizer)
+    submap = twice_mapped(config, confidence, rasterizer, SMALL)
     for times in (4, 12):
         update = AutogradOptimization(submap, config, confidence, rasterizer)
         with counted_waits() as waits:
@@ -185,7 +166,7 @@ def test_what_cannot_be_recorded_is_done_step_by_step(
 ) -> None:
     """Said once, with what went wrong first, where it will go wrong again; tried again where memory was too little."""
     config, confidence, plain = SURFACE, ConfidenceConfig(), opened(None)
-    submap = mapped(config, confidence, plain)
+    submap = twice_mapped(config, confidence, plain, SMALL)
     expected, loss = optimized(submap, config, confidence, plain)
     said = [
         "CUDA graphs are not used, which is slower and changes nothing else: operation not permitted when stream is "
