@@ -17,9 +17,9 @@ import torch
 
 from tcgsplat.config import SlamConfig
 from tcgsplat.geometry import se3
-from tcgsplat.loop.closer import Closure, LoopCloser, odometry
+from tcgsplat.loop.closer import Closure, LoopCloser
+from tcgsplat.loop.edge import Edge, odometry
 from tcgsplat.loop.places import measured
-from tcgsplat.loop.pose_graph import Edge
 from tcgsplat.loop.relocalization import Relocalized
 from tcgsplat.mapping.completion import completed
 from tcgsplat.mapping.feedback import judged

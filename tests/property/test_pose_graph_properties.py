@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tcgsplat.geometry import se3
-from tcgsplat.loop.pose_graph import Edge, solved
+from tcgsplat.loop.edge import Edge
+from tcgsplat.loop.pose_graph import solved
 from tcgsplat.tensors import Pose
 
 repeatable = settings(deadline=None, derandomize=True, max_examples=30)

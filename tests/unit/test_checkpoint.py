@@ -10,7 +10,7 @@ import torch
 
 from tcgsplat.errors import ArchiveError
 from tcgsplat.geometry import se3
-from tcgsplat.loop.pose_graph import Edge
+from tcgsplat.loop.edge import Edge
 from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.submap import Submap

@@ -26,7 +26,8 @@ from tcgsplat.cli.usage import UsageError
 from tcgsplat.config import SlamConfig, from_toml
 from tcgsplat.errors import ArchiveError, ConfigError
 from tcgsplat.geometry import se3
-from tcgsplat.loop.closer import Closure, odometry
+from tcgsplat.loop.closer import Closure
+from tcgsplat.loop.edge import odometry
 from tcgsplat.presets import preset
 from tcgsplat.scene.trajectory import TrackedPose, Trajectory
 from tcgsplat.slam import StepReport
@@ -56,6 +57,11 @@ def test_help_and_version_are_there_at_once(argument: str):
     assert done.returncode == 0, done.stderr
     assert time.perf_counter() - started < ENOUGH
     assert done.stdout.startswith("usage: tcgsplat" if argument == "--help" else f"tcgsplat {__version__}\n")
+
+
+def test_a_run_begins_without_what_only_closing_a_loop_needs():
+    done = python("import sys, tcgsplat.cli.recorder; sys.exit('gtsam' in sys.modules)")
+    assert done.returncode == 0, done.stderr
 
 
 def test_help_lists_every_command_and_every_command_is_there(capsys: pytest.CaptureFixture[str]):

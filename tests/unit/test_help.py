@@ -9,7 +9,7 @@ import pytest
 from tcgsplat.cli.main import COMMANDS, main
 
 LIGHT = ["run", "demo", "eval", "export", "presets", "doctor"]
-HEAVY = {"torch", "numba", "numpy", "cv2", "scipy", "matplotlib"}
+HEAVY = {"torch", "numba", "numpy", "cv2", "scipy", "matplotlib", "typeguard"}
 
 
 @pytest.mark.parametrize("command", LIGHT)

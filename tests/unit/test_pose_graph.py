@@ -11,7 +11,8 @@ from torch import Tensor
 
 from tcgsplat.geometry import se3
 from tcgsplat.loop import pose_graph
-from tcgsplat.loop.pose_graph import Edge, solved
+from tcgsplat.loop.edge import Edge
+from tcgsplat.loop.pose_graph import solved
 from tcgsplat.tensors import Pose
 
 NODES = 9

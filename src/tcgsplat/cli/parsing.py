@@ -8,7 +8,8 @@ import textwrap
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import replace
-from typing import Annotated, Any
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
 
 import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
@@ -56,8 +57,17 @@ def _in_order(field: StructFieldSpec) -> StructFieldSpec:
         text = field.helptext() if callable(field.helptext) else field.helptext
         return None if text is None else re.sub(r"\s*\n\s*", " ", text)
 
-    typed: Any = Annotated[field.type, tyro.conf.arg(help_behavior_hint=_default)]
+    typed: Any = Annotated[_plain(field.type), tyro.conf.arg(help_behavior_hint=_default)]
     return replace(field, helptext=told, type=typed)
+
+
+def _plain(kind: Any) -> Any:
+    """A type that tyro itself can hold a default against; for others it imports typeguard, a twentieth of the start."""
+    if get_origin(kind) is Annotated:
+        return Annotated[(_plain(kind.__origin__), *kind.__metadata__)]  # type: ignore[return-value]
+    if get_origin(kind) is UnionType:
+        return Union[get_args(kind)]  # noqa: UP007
+    return dict if get_origin(kind) is dict else kind
 
 
 def _default(value: str) -> str:

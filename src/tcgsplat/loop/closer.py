@@ -9,13 +9,11 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
 from tcgsplat.loop.descriptor import Vectors
+from tcgsplat.loop.edge import Edge
 from tcgsplat.loop.places import measured
-from tcgsplat.loop.pose_graph import Edge, solved
 from tcgsplat.loop.registration import Registration, Side, registered
 from tcgsplat.loop.relocalization import Relocalized, Relocalizer
 from tcgsplat.loop.retrieval import Candidate
@@ -47,17 +45,6 @@ class Closure:
     """Wall time."""
 
 
-def odometry(source: int, target: int, T_target_source: Pose) -> Edge:
-    """The edge from a submap to the one where its first frame was tracked.
-
-    Its spread grows with the way between the two: 3 mm and 1 % of it, 1.5 mrad and 0.5 % of the turn. Errors of
-    tracking on synthetic data with a Kinect's noise are below that, by a half as a rule.
-    """
-    way, turn = se3.translation_norm(T_target_source), se3.rotation_angle(T_target_source)
-    spread = np.array([0.003 + 0.01 * way] * 3 + [0.0015 + 0.005 * turn] * 3)
-    return Edge(source, target, T_target_source, np.diag(1 / spread**2), loop=False)
-
-
 class LoopCloser:
     """Keeps what is known of finished submaps: their places, and the edges between them."""
 
@@ -81,7 +68,7 @@ class LoopCloser:
     def restore(self, T_world_map: Sequence[Pose], edges: Sequence[Edge]) -> None:
         """Know again what was known when the last of these submaps began."""
         self.T_world_map, self.edges = tuple(T_world_map), tuple(edges)
-        self.rejected = tuple(self.edges[i] for i in solved(self.T_world_map, self.edges).rejected)
+        self._solve(move=False)
         for index in range(len(T_world_map) - 1):
             self._relocalizer.remember(self._load(index))
 
@@ -109,10 +96,18 @@ class LoopCloser:
         if not loops:
             return Closure(index, (), registrations, self.edges, self.rejected, time.perf_counter() - started)
         self.edges = (*self.edges, *loops)
-        solution = solved(self.T_world_map, self.edges)
-        self.T_world_map, self.rejected = solution.T_world_map, tuple(self.edges[i] for i in solution.rejected)
+        self._solve(move=True)
         seconds = time.perf_counter() - started
         return Closure(index, self.T_world_map, registrations, self.edges, self.rejected, seconds)
+
+    def _solve(self, *, move: bool) -> None:
+        """Which edges are rejected by now, and, if the submaps are to move, where they stand."""
+        from tcgsplat.loop.pose_graph import solved  # noqa: PLC0415 (gtsam takes a twentieth of the start-up)
+
+        solution = solved(self.T_world_map, self.edges)
+        self.rejected = tuple(self.edges[place] for place in solution.rejected)
+        if move:
+            self.T_world_map = solution.T_world_map
 
     def _registered(self, submap: Submap, candidate: Candidate) -> Registration:
         T_other_this = se3.inverse(self.T_world_map[candidate.submap]) @ self.T_world_map[submap.index]

@@ -17,10 +17,11 @@ import gtsam
 import numpy as np
 import scipy  # its parts when they are used: together they are a tenth of the start-up
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tcgsplat.geometry import se3
+from tcgsplat.loop.edge import Edge
 from tcgsplat.tensors import Pose
 
 _ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
@@ -44,19 +45,6 @@ _Table = Float[Tensor, "m m"]
 last row and column for the residuals."""
 _Edges = Bool[Tensor, " n"]
 """Some of the loop edges."""
-
-
-@dataclass(frozen=True, eq=False)
-class Edge:
-    """How one submap stands to another."""
-
-    source: int
-    target: int
-    T_target_source: Pose
-    information: Float64[np.ndarray, "6 6"]
-    """Inverse covariance of xi, translation first (metres, radians), where T_target_source exp(xi) is the truth."""
-    loop: bool
-    """It may be wrong, as an edge of the odometry may not."""
 
 
 @dataclass(frozen=True, eq=False)

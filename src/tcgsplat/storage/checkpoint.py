@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from tcgsplat.errors import ArchiveError
-from tcgsplat.loop.pose_graph import Edge
+from tcgsplat.loop.edge import Edge
 from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.trajectory import Trajectory
