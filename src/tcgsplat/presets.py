@@ -91,6 +91,8 @@ _PUBLISHED: tuple[tuple[str, _Three, Origin, str], ...] = (
     ("tracker.synchronization", _same("none"), "base", "the base system takes both images for one instant"),
     ("tracker.smoothing", _same(False), "base", "the base system takes depth as it comes"),
     ("tracker.exposure", _same(False), "ours", "the paper maps pictures as they come"),
+    ("tracker.view_distance", _same(0.0), "base", "of no use to descent, which renders in every iteration"),
+    ("tracker.view_angle", _same(0.0), "base", "as view_distance"),
     ("tracker.descent.iterations", (60, 200, 200), "base", "the base system doubles them for a bad start; we do not"),
     ("tracker.descent.rotation_rate", (0.0002, 0.002, 0.002), "base", "cam_rot_lr"),
     ("tracker.descent.translation_rate", (0.002, 0.01, 0.01), "base", "cam_trans_lr"),

@@ -15,7 +15,7 @@ from tcgsplat.render.cuda.launching import Compiled, Kernels, compiled, nvrtc_li
 from tcgsplat.render.view import Rendering
 from tcgsplat.scene.frame import Frame
 from tcgsplat.tracking import cuda_alignment
-from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, align
+from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, align, reference_view
 
 EMULATED = pytest.param(
     "emulated", marks=pytest.mark.skipif(COMPILER is None, reason="no C++ compiler to emulate with")
@@ -24,6 +24,8 @@ REAL = pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available
 ODD = Camera(fx=70.0, fy=71.5, cx=58.3, cy=40.7, width=117, height=83)
 WIDE = Camera(fx=130.0, fy=133.0, cx=103.2, cy=59.4, width=207, height=119)  # sampled, not every pixel
 T_LIVE = pose(0.03, -0.02, 0.04, degrees=(1.0, -1.5, 2.0))
+GUESS = T_LIVE @ pose(0.004, -0.003, 0.002, degrees=(0.3, -0.2, 0.1))
+"""Not where the view is from."""
 
 
 @pytest.fixture(scope="module", params=[EMULATED, REAL])
@@ -68,10 +70,11 @@ def both(
 ) -> tuple[Alignment, Alignment]:
     g = torch.Generator().manual_seed(5)
     weight = 0.3 + 0.7 * torch.rand(live.depth.shape, generator=g)
-    on_cpu = align(live, rendering, weight, T_LIVE, config)
+    on_cpu = align(live, reference_view(rendering, weight, live.camera, T_LIVE, config), GUESS, config)
     compiled_kernels, device = kernels
-    there = live.to(device), rendering.to(device), weight.to(device)
-    return on_cpu, cuda_alignment.align(compiled_kernels, *there, T_LIVE, config)
+    there = rendering.to(device), weight.to(device), live.camera
+    view = cuda_alignment.reference_view(compiled_kernels, *there, T_LIVE, config)
+    return on_cpu, cuda_alignment.align(compiled_kernels, live.to(device), view, GUESS, config)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +111,7 @@ def test_nothing_in_common_leaves_the_guess(kernels: tuple[Kernels, torch.device
     live = replace(live, valid=torch.zeros_like(live.valid), depth=torch.zeros_like(live.depth))
     expected, found = both(kernels, live, rendering_of(reference), AlignmentConfig())
     assert found.overlap == expected.overlap == 0
-    torch.testing.assert_close(found.T_map_cam, T_LIVE)
+    torch.testing.assert_close(found.T_map_cam, GUESS)
 
 
 def test_numbers_that_are_none_are_not_hidden(kernels: tuple[Kernels, torch.device]) -> None:

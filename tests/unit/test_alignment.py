@@ -10,11 +10,12 @@ from torch import Tensor
 
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.view import Rendering
 from tcgsplat.scene.frame import Frame
 from tcgsplat.tensors import Pose
 from tcgsplat.tracking import alignment
 from tcgsplat.tracking import alignment_kernels as kernels
-from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, _exp, align, correlation
+from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, _exp, align, correlation, reference_view
 from tcgsplat.tracking.pyramids import halved, halved_depth, live_image, live_view, luma, rendered_view
 
 CONFIG = AlignmentConfig(
@@ -26,7 +27,19 @@ TELE = replace(CAMERA, fx=160.0, fy=162.0)
 
 
 def aligned(live: Frame, reference: Frame, weight: Tensor = EVERYWHERE, config: AlignmentConfig = CONFIG) -> Alignment:
-    return align(live, rendering_of(reference), weight, se3.identity(), config)
+    return at_once(live, rendering_of(reference), weight, config=config)
+
+
+def at_once(
+    live: Frame,
+    rendering: Rendering,
+    weight: Tensor = EVERYWHERE,
+    T_map_ref: Pose | None = None,
+    config: AlignmentConfig = CONFIG,
+) -> Alignment:
+    """To a view from the very guess."""
+    T = se3.identity() if T_map_ref is None else T_map_ref
+    return align(live, reference_view(rendering, weight, live.camera, T, config), T, config)
 
 
 def normal_equations(
@@ -258,10 +271,23 @@ def test_the_pose_of_the_view_is_where_it_starts_from(room: Room) -> None:
     """The same motion seen from a view that stands elsewhere in the map."""
     T_map_ref = pose(1.0, -2.0, 0.5, degrees=(40, 10, -70))
     here, there = (
-        align(room.frame(T_NEAR), rendering_of(room.frame()), EVERYWHERE, T, CONFIG).T_map_cam
+        at_once(room.frame(T_NEAR), rendering_of(room.frame()), T_map_ref=T).T_map_cam
         for T in (se3.identity(), T_map_ref)
     )
     torch.testing.assert_close(there, T_map_ref @ here)
+
+
+@pytest.mark.parametrize("T_true", [T_NEAR, pose(0.03, -0.01, 0.02, degrees=(1.0, -2.0, 0.5))])
+def test_one_view_does_for_several_frames(room: Room, T_true: Pose) -> None:
+    """What is found does not depend on how far the guess is from where the view was rendered."""
+    view = reference_view(rendering_of(room.frame()), EVERYWHERE, CAMERA, se3.identity(), CONFIG)
+    near, far = (align(room.frame(T_true), view, guess, CONFIG) for guess in (T_true, se3.identity()))
+    assert errors(near.T_map_cam, far.T_map_cam)[0] < 0.05
+    assert errors(near.T_map_cam, T_true)[0] < 1
+    hasty = replace(CONFIG, iterations=(1, 0, 0))
+    view = reference_view(rendering_of(room.frame()), EVERYWHERE, CAMERA, se3.identity(), hasty)
+    near, far = (align(room.frame(T_true), view, guess, hasty) for guess in (T_true, se3.identity()))
+    assert 2 * errors(near.T_map_cam, T_true)[0] < errors(far.T_map_cam, T_true)[0]
 
 
 def test_a_frame_is_aligned_with_itself_exactly(room: Room) -> None:
@@ -346,8 +372,8 @@ def test_what_the_map_does_not_cover_gives_no_points(room: Room) -> None:
     hole[:, 48:] = True
     thin = torch.where(hole, 0.0, 0.99)
     holed = rendering_of(room.frame(), alpha=thin)
-    full = align(room.frame(T_NEAR), view, EVERYWHERE, se3.identity(), CONFIG)
-    half = align(room.frame(T_NEAR), holed, EVERYWHERE, se3.identity(), CONFIG)
+    full = at_once(room.frame(T_NEAR), view)
+    half = at_once(room.frame(T_NEAR), holed)
     assert errors(full.T_map_cam, T_NEAR)[0] < 1
     assert errors(half.T_map_cam, T_NEAR)[0] < 2.5
 
@@ -359,10 +385,7 @@ def test_thin_coverage_gives_no_points(room: Room) -> None:
     thin[:, 40:] = True
     wrong = replace(frame, depth=torch.where(thin, frame.depth - 0.03, frame.depth))
     view = rendering_of(wrong, alpha=torch.where(thin, 0.6, 0.99))
-    strict, lax = (
-        align(room.frame(T_NEAR), view, EVERYWHERE, se3.identity(), replace(CONFIG, min_alpha=limit))
-        for limit in (0.7, 0.5)
-    )
+    strict, lax = (at_once(room.frame(T_NEAR), view, config=replace(CONFIG, min_alpha=limit)) for limit in (0.7, 0.5))
     assert errors(strict.T_map_cam, T_NEAR)[0] < 2.5
     assert errors(lax.T_map_cam, T_NEAR)[0] > 5
 
@@ -396,7 +419,7 @@ def test_a_common_factor_on_all_weights_changes_nothing(room: Room) -> None:
 def test_the_inputs_stay_as_they_are(room: Room) -> None:
     frame, view = room.frame(T_NEAR), rendering_of(room.frame())
     before = [t.clone() for t in (frame.color, frame.depth, view.color, view.composited_plane_depth)]
-    align(frame, view, EVERYWHERE, se3.identity(), CONFIG)
+    at_once(frame, view)
     after = (frame.color, frame.depth, view.color, view.composited_plane_depth)
     assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
 

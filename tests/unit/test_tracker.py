@@ -12,13 +12,14 @@ from torch import Tensor
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
-from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.protocol import Raster, Rasterizer, Splats
 from tcgsplat.render.view import render_view
 from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.alignment import AlignmentConfig, align
+from tcgsplat.tracking.alignment import AlignmentConfig, align, reference_view
 from tcgsplat.tracking.descent import DescentConfig
 from tcgsplat.tracking.tracker import Tracker, TrackerConfig
 
@@ -82,6 +83,52 @@ def test_a_frame_is_tracked_against_the_map(
     R = tracked.T_map_cam[:3, :3]
     torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64), atol=1e-12, rtol=0)
     assert tracked.overlap > 0.9 and tracked.agreement > 0.9 and tracked.correlation > 0.9
+
+
+class Counting:
+    """A rasterizer that counts what it draws."""
+
+    def __init__(self, rasterizer: Rasterizer) -> None:
+        self.name, self.device, self.reserved = rasterizer.name, rasterizer.device, rasterizer.reserved
+        self._rasterizer, self.drawn = rasterizer, 0
+
+    def __call__(self, splats: Splats, camera: Camera, T_cam_map: Pose) -> Raster:
+        self.drawn += 1
+        return self._rasterizer(splats, camera, T_cam_map)
+
+
+def test_the_map_is_drawn_again_when_the_camera_has_moved_on_or_the_map_is_another(
+    room: Room, corner: Submap, rasterizer: Rasterizer
+) -> None:
+    counting = Counting(rasterizer)
+    config = replace(ALIGNMENT, view_distance=0.02, view_angle=2.0)
+    tracking, another = tracker(counting, config), replace(corner)
+    wide = replace(CAMERA, fx=CAMERA.fx + 1)
+    for T, submap, camera, drawn in [
+        (pose(), corner, CAMERA, 1),
+        (pose(0.015, 0, 0, degrees=(0, 1.5, 0)), corner, CAMERA, 1),
+        (pose(0.025, 0, 0), corner, CAMERA, 2),
+        (pose(0.025, 0, 0, degrees=(0, 2.5, 0)), corner, CAMERA, 3),
+        (pose(0.025, 0, 0, degrees=(0, 2.5, 0)), another, CAMERA, 4),
+        (pose(0.025, 0, 0, degrees=(0, 2.5, 0)), another, wide, 5),
+    ]:
+        tracked = tracking.track(replace(room.frame(T), camera=camera), submap, T)
+        assert tracked.converged and counting.drawn == drawn, tracked.lost
+        assert camera is wide or errors(tracked.T_map_cam, T)[0] < 4
+
+
+def test_a_frame_is_not_lost_for_being_aligned_to_an_old_view(
+    room: Room, corner: Submap, rasterizer: Rasterizer
+) -> None:
+    """From far away the view that was kept shows something else: the frame is tried again against a new one."""
+    T_far = pose(degrees=(0, 60, 0))
+    counting = Counting(rasterizer)
+    tracking = tracker(counting, replace(ALIGNMENT, view_distance=10.0, view_angle=180.0))
+    assert tracking.track(room.frame(), corner, se3.identity()).converged
+    old = tracking.track(room.frame(T_far), corner, T_far)
+    fresh = tracker(rasterizer).track(room.frame(T_far), corner, T_far)
+    assert counting.drawn == 2
+    assert torch.equal(old.T_map_cam, fresh.T_map_cam) and old.lost == fresh.lost
 
 
 @pytest.mark.parametrize("case", UNUSABLE)
@@ -165,21 +212,21 @@ def test_only_what_is_all_but_opaque_tells_the_exposure(alpha: float) -> None:
     frame = Room().frame()
     thin = torch.zeros_like(frame.valid)
     thin[:, 40:] = True
-    view = rendering_of(frame, alpha=torch.where(thin, alpha, 1.0))
+    rendering, config = rendering_of(frame, alpha=torch.where(thin, alpha, 1.0)), AlignmentConfig()
+    view = reference_view(rendering, torch.ones_like(frame.depth), frame.camera, se3.identity(), config)
     for shown in (0.0, 0.5):  # behind the thin half, black or grey shows through
         color = torch.where(thin[..., None], alpha * frame.color + (1 - alpha) * shown, frame.color)
-        found = align(
-            replace(frame, color=color), view, torch.ones_like(frame.depth), se3.identity(), AlignmentConfig()
-        )
+        found = align(replace(frame, color=color), view, se3.identity(), config)
         assert (found.exposure.gain, found.exposure.offset) == pytest.approx((1.0, 0.0), abs=0.005)
 
 
 @pytest.mark.parametrize("iterations", [(5, 3, 3), (0, 3, 3), (0, 0, 3)])
 def test_the_exposure_is_found_at_the_finest_level_that_has_passes(iterations: tuple[int, ...]) -> None:
     frame, exposure = Room().frame(), Exposure(0.7, 0.1)
-    exposed, view = replace(frame, color=exposure.applied(frame.color)), rendering_of(frame, alpha=1.0)
-    config = AlignmentConfig(iterations=iterations)
-    found = align(exposed, view, torch.ones_like(frame.depth), se3.identity(), config).exposure
+    exposed, config = replace(frame, color=exposure.applied(frame.color)), AlignmentConfig(iterations=iterations)
+    rendering, everywhere = rendering_of(frame, alpha=1.0), torch.ones_like(frame.depth)
+    view = reference_view(rendering, everywhere, frame.camera, se3.identity(), config)
+    found = align(exposed, view, se3.identity(), config).exposure
     middle = float(frame.color.mean())
     assert found.gain * middle + found.offset == pytest.approx(exposure.gain * middle + exposure.offset, abs=0.01)
     assert found.gain == pytest.approx(0.7, abs=0.05)

@@ -1,9 +1,9 @@
 """Gauss-Newton direct alignment of a frame against one render of the map.
 
-The map is drawn once, at the predicted pose, with colour, planar depth and confidence; the live frame is then aligned
+The map is drawn once, near the predicted pose, with colour, planar depth and confidence; live frames are then aligned
 to that view, coarse to fine, by joint photometric and point-to-plane residuals under Student-t weights, each weighted
-by the tracking weight of Eq. 18. One render a frame instead of one an iteration is what makes it fast; `descent.py`
-minimises the same weighted residual through the rasterizer, as the paper does.
+by the tracking weight of Eq. 18. One render for a frame or several, instead of one an iteration, is what makes it fast;
+`descent.py` minimises the same weighted residual through the rasterizer, as the paper does.
 """
 
 import math
@@ -136,18 +136,29 @@ def normal_equations(points: Floats, live: Floats, constants: Floats) -> Doubles
 
 
 @dataclass(frozen=True)
-class _Level:
-    """Both views at one resolution."""
+class Level:
+    """A rendered view at one resolution."""
 
     passes: int
     points: Floats
-    """Of the rendered view, [POINT, n]."""
-    live: Floats
-    """Of the frame, [h, w, CHANNELS]."""
+    """[POINT, n]"""
     intrinsics: Floats
     """fx, fy, cx, cy, pixels."""
     gate: float
     """Metres, times (1 + z/2)."""
+
+
+@dataclass(frozen=True)
+class ReferenceView:
+    """A rendered view as frames are aligned to it: made once, used while the camera stays near."""
+
+    T_map_ref: Pose
+    """Where it was rendered."""
+    camera: Camera
+    levels: tuple[Level, ...]
+    """Finest first; those that have no passes, too, without points."""
+    solid_points: Floats
+    """Of the finest level with passes, that tell the exposure."""
 
 
 def passes_of_levels(config: AlignmentConfig, camera: Camera) -> tuple[int, ...]:
@@ -156,36 +167,62 @@ def passes_of_levels(config: AlignmentConfig, camera: Camera) -> tuple[int, ...]
     return (*config.iterations, *[config.iterations[-1]] * more)
 
 
-def _levels(frame: Frame, rendering: Rendering, weight: Plane, config: AlignmentConfig) -> tuple[list[_Level], Floats]:
-    """The levels that have passes, finest first; and points that tell the exposure, for the first of them.
+def reference_view(
+    rendering: Rendering, weight: Plane, camera: Camera, T_map_ref: Pose, config: AlignmentConfig
+) -> ReferenceView:
+    """A rendered view made ready.
 
     The solver compares with colours that are divided by alpha. Through thin places the background of the map's frame
     shows, which optimisation closes in time: dividing makes them too bright, not dividing leaves them too dark. So
     exposure is told by colours that are not divided, where the map is all but opaque.
+
+    Args:
+        rendering: The map seen from `T_map_ref`, on the CPU.
+        weight: W_tr of Eq. 18 at every rendered pixel.
+        camera: That it was rendered with.
+        T_map_ref: Where.
+        config: Constants.
     """
     composited = luma(rendering.color)
     intensity, depth = rendered_view(rendering, composited, config.min_alpha)
     solid = np.where(rendering.alpha.numpy() > SOLID, depth, NOTHING)
-    solid_points: Floats = np.empty((0, 0), np.float32)
-    weights = np.ascontiguousarray(weight.numpy())
-    live, live_depth = live_view(frame)
-    camera, levels = frame.camera, list[_Level]()
+    weights, scaled = np.ascontiguousarray(weight.numpy()), camera
+    levels, nothing = list[Level](), np.empty((kernels.POINT, 0), np.float32)
+    solid_points: Floats = nothing
     for number, passes in enumerate(passes_of_levels(config, camera)):
+        begun = any(level.passes for level in levels)
         if number:
-            intensity, weights, live = (halved(image) for image in (intensity, weights, live))
-            depth, live_depth = halved_depth(depth), halved_depth(live_depth)
-            if not levels:
+            intensity, weights, depth = halved(intensity), halved(weights), halved_depth(depth)
+            if not begun:
                 composited, solid = halved(composited), halved_depth(solid)
-            camera = camera.scaled(0.5)
-        if passes:
-            intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-            sampling = (2, config.stride) if camera.width > SPARSE else (1, 1)
-            gate = 2 * config.gate if number else config.gate
-            points = reference_points(intensity, depth, weights, intrinsics, *sampling)
-            if not levels:
-                solid_points = reference_points(composited, solid, weights, intrinsics, *sampling)
-            levels.append(_Level(passes, points, live_image(live, live_depth), intrinsics, gate))
-    return levels, solid_points
+            scaled = scaled.scaled(0.5)
+        intrinsics = np.array([scaled.fx, scaled.fy, scaled.cx, scaled.cy], np.float32)
+        sampling = (2, config.stride) if scaled.width > SPARSE else (1, 1)
+        points = reference_points(intensity, depth, weights, intrinsics, *sampling) if passes else nothing
+        if passes and not begun:
+            solid_points = reference_points(composited, solid, weights, intrinsics, *sampling)
+        levels.append(Level(passes, points, intrinsics, 2 * config.gate if number else config.gate))
+    return ReferenceView(T_map_ref, camera, tuple(levels), solid_points)
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Both views at one resolution."""
+
+    level: Level
+    live: Floats
+    """Of the frame, [h, w, CHANNELS]."""
+
+
+def _pairs(frame: Frame, view: ReferenceView) -> list[_Pair]:
+    """With the frame, at the levels that have passes; finest first."""
+    pairs, (live, depth) = list[_Pair](), live_view(frame)
+    for number, level in enumerate(view.levels):
+        if number:
+            live, depth = halved(live), halved_depth(depth)
+        if level.passes:
+            pairs.append(_Pair(level, live_image(live, depth)))
+    return pairs
 
 
 @dataclass
@@ -223,7 +260,7 @@ def correlation(weight: float, x: float, y: float, xx: float, xy: float, yy: flo
     return (xy / total - mean_x * mean_y + prior) / math.sqrt(variance_x * variance_y)
 
 
-def _constants(level: _Level, T: Doubles, photometry: Photometry, config: AlignmentConfig) -> Floats:
+def _constants(level: Level, T: Doubles, photometry: Photometry, config: AlignmentConfig) -> Floats:
     """Of one pass, in the kernel's order."""
     constants = np.empty(kernels.CONSTANTS, np.float32)
     constants[kernels.ROTATION : kernels.TRANSLATION] = T[:3, :3].ravel()
@@ -236,9 +273,9 @@ def _constants(level: _Level, T: Doubles, photometry: Photometry, config: Alignm
     return constants
 
 
-def _sums(level: _Level, T: Doubles, photometry: Photometry, config: AlignmentConfig) -> Doubles:
+def _sums(pair: _Pair, T: Doubles, photometry: Photometry, config: AlignmentConfig) -> Doubles:
     """Of a pass over a level."""
-    return normal_equations(level.points, level.live, _constants(level, T, photometry, config))
+    return normal_equations(pair.level.points, pair.live, _constants(pair.level, T, photometry, config))
 
 
 def _equations(sums: Doubles) -> Equations:
@@ -267,40 +304,40 @@ def _exp(tangent: Doubles) -> Doubles:
     return T
 
 
-def align(frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, config: AlignmentConfig) -> Alignment:
+def align(frame: Frame, view: ReferenceView, guess: Pose, config: AlignmentConfig) -> Alignment:
     """Align a frame to a rendered view.
 
     Args:
-        frame: The live frame, on the CPU.
-        rendering: The map seen from `T_map_ref` with the frame's camera.
-        weight: W_tr of Eq. 18 at every rendered pixel.
-        T_map_ref: Pose of the rendered view, and the guess to start from.
+        frame: The live frame, on the CPU, of the view's camera.
+        view: Of the map, from somewhere near.
+        guess: `T_map_cam` to start from.
         config: Constants.
     """
-    levels, solid_points = _levels(frame, rendering, weight, config)
-    finest = levels[0]
-    T = np.eye(4)  # reference camera to live camera
+    pairs = _pairs(frame, view)
+    finest = pairs[0]
+    T = (se3.inverse(guess) @ view.T_map_ref).numpy()  # reference camera to live camera
     photometry, sums, passes = Photometry(), np.zeros(kernels.SUMS), 0
-    for level in reversed(levels):
+    for pair in reversed(pairs):
         photometry.color_scale, photometry.depth_scale = COLOR_SCALE, DEPTH_SCALE
-        for _ in range(level.passes):
-            sums = _sums(level, T, photometry, config)
+        for _ in range(pair.level.passes):
+            sums = _sums(pair, T, photometry, config)
             photometry.refit(sums)
             step = _step(sums)
             T = _exp(step) @ T
             passes += 1
-            if np.linalg.norm(step[:3]) < SMALL and np.linalg.norm(step[3:]) < SMALL and level is not finest:
+            if np.linalg.norm(step[:3]) < SMALL and np.linalg.norm(step[3:]) < SMALL and pair is not finest:
                 break
+    solid = replace(finest, level=replace(finest.level, points=view.solid_points))
     return concluded(
-        T_map_ref,
+        view.T_map_ref,
         T,
         passes,
         photometry,
-        points=int(np.count_nonzero(finest.points[kernels.PZ])),
+        points=int(np.count_nonzero(finest.level.points[kernels.PZ])),
         last=sums,
         color=_sums(finest, T, photometry, replace(config, depth_weight=0.0)),
         both=_sums(finest, T, photometry, replace(config, depth_weight=1.0)),
-        solid=_sums(replace(finest, points=solid_points), T, photometry, config),
+        solid=_sums(solid, T, photometry, config),
     )
 
 

@@ -1,12 +1,13 @@
 """Direct alignment on a GPU: the solver of alignment.py, whose passes follow one another without being waited for."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.cuda.launching import THREADS, Compiled, Kernels, source
 from tcgsplat.render.view import Rendering
@@ -36,24 +37,42 @@ def alignment_kernels(device: torch.device) -> Kernels:
 
 
 @cache
-def _start(device: torch.device) -> Tensor:
-    """The state before the first pass."""
+def _photometry(device: torch.device) -> Tensor:
+    """The state before the first pass, but for the pose."""
     photometry = Photometry()
-    rest = [photometry.gain, photometry.offset, photometry.color_scale, photometry.depth_scale, 0.0, 0.0]
-    return torch.cat((torch.eye(4, dtype=torch.float64).flatten(), torch.tensor(rest, dtype=torch.float64))).to(device)
+    start = [photometry.gain, photometry.offset, photometry.color_scale, photometry.depth_scale, 0.0, 0.0]
+    return torch.tensor(start, dtype=torch.float64, device=device)
 
 
 @dataclass(frozen=True)
-class _Level:
-    """Both views at one resolution."""
+class Level:
+    """A rendered view at one resolution."""
 
     passes: int
     points: Tensor
-    """Of the rendered view, [POINT, n]."""
-    live: Tensor
-    """Of the frame, [h, w, CHANNELS]."""
+    """[POINT, n]"""
     camera: Camera
     gate: float
+
+
+@dataclass(frozen=True)
+class CudaReferenceView:
+    """As `alignment.ReferenceView`, on a GPU."""
+
+    T_map_ref: Pose
+    """On the CPU."""
+    camera: Camera
+    levels: tuple[Level, ...]
+    solid_points: Tensor
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Both views at one resolution."""
+
+    level: Level
+    live: Tensor
+    """Of the frame, [h, w, CHANNELS]."""
 
 
 class _Images:
@@ -113,15 +132,16 @@ class _Images:
         return points
 
     def passed(
-        self, level: _Level, state: Tensor, config: AlignmentConfig, *, balance: float, moves: bool, finest: bool
+        self, pair: _Pair, state: Tensor, config: AlignmentConfig, *, balance: float, moves: bool, finest: bool
     ) -> Tensor:
         """The sums of a pass [SUMS], after which the state follows if it moves."""
-        n, (height, width, _) = level.points.shape[1], level.live.shape
-        blocks, camera = max(-(-n // THREADS), 1), level.camera
+        level, (height, width, _) = pair.level, pair.live.shape
+        n, camera = level.points.shape[1], level.camera
+        blocks = max(-(-n // THREADS), 1)
         partial = level.points.new_empty(blocks, _PADDED)
         sums = torch.zeros(cpu_kernels.SUMS, dtype=torch.float64, device=state.device)
         self._kernels.launch("normal_equations", blocks, {
-            "points": level.points, "live": level.live, "state": state, "partial": partial, "n": n, "width": width,
+            "points": level.points, "live": pair.live, "state": state, "partial": partial, "n": n, "width": width,
             "height": height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "gate": level.gate,
             "balance": balance, "sigma_floor": config.sigma_floor, "sigma_slope": config.sigma_slope,
         })  # fmt: skip
@@ -137,61 +157,79 @@ class _Images:
             self._kernels.launch(kernel, -(-count // THREADS), given)
 
 
-def _levels(
-    images: _Images, frame: Frame, rendering: Rendering, weight: Plane, config: AlignmentConfig
-) -> tuple[list[_Level], Tensor]:
-    """As `alignment._levels`."""
+def reference_view(
+    kernels: Kernels, rendering: Rendering, weight: Plane, camera: Camera, T_map_ref: Pose, config: AlignmentConfig
+) -> CudaReferenceView:
+    """As `alignment.reference_view`, of a rendering on a GPU.
+
+    Args:
+        kernels: Of `alignment_text`, for that GPU.
+        rendering: The map seen from `T_map_ref`.
+        weight: W_tr of Eq. 18 at every rendered pixel.
+        camera: That it was rendered with.
+        T_map_ref: Where; on the CPU.
+        config: Constants.
+    """
+    images, weights, scaled, levels = _Images(kernels), weight.contiguous(), camera, list[Level]()
     intensity, depth, composited, solid = images.rendered(rendering, config.min_alpha)
-    weights, (live, live_depth) = weight.contiguous(), images.live(frame)
-    camera, levels, solid_points = frame.camera, list[_Level](), depth.new_empty(cpu_kernels.POINT, 0)
+    nothing = depth.new_empty(cpu_kernels.POINT, 0)
+    solid_points = nothing
     for number, passes in enumerate(passes_of_levels(config, camera)):
+        begun = any(level.passes for level in levels)
         if number:
-            intensity, weights, live = (images.halved("intensity", image) for image in (intensity, weights, live))
-            depth, live_depth = images.halved("depth", depth), images.halved("depth", live_depth)
-            if not levels:
+            intensity, weights = images.halved("intensity", intensity), images.halved("intensity", weights)
+            depth = images.halved("depth", depth)
+            if not begun:
                 composited, solid = images.halved("intensity", composited), images.halved("depth", solid)
-            camera = camera.scaled(0.5)
-        if passes:
-            sampling = (2, config.stride) if camera.width > cpu.SPARSE else (1, 1)
-            gate = 2 * config.gate if number else config.gate
-            if not levels:
-                solid_points = images.points(composited, solid, weights, camera, *sampling)
-            points = images.points(intensity, depth, weights, camera, *sampling)
-            levels.append(_Level(passes, points, images.sampled(live, live_depth), camera, gate))
-    return levels, solid_points
+            scaled = scaled.scaled(0.5)
+        sampling = (2, config.stride) if scaled.width > cpu.SPARSE else (1, 1)
+        points = images.points(intensity, depth, weights, scaled, *sampling) if passes else nothing
+        if passes and not begun:
+            solid_points = images.points(composited, solid, weights, scaled, *sampling)
+        levels.append(Level(passes, points, scaled, 2 * config.gate if number else config.gate))
+    return CudaReferenceView(T_map_ref, camera, tuple(levels), solid_points)
 
 
-def align(
-    kernels: Kernels, frame: Frame, rendering: Rendering, weight: Plane, T_map_ref: Pose, config: AlignmentConfig
-) -> Alignment:
+def _pairs(images: _Images, frame: Frame, view: CudaReferenceView) -> list[_Pair]:
+    """As `alignment._pairs`."""
+    pairs, (live, depth) = list[_Pair](), images.live(frame)
+    for number, level in enumerate(view.levels):
+        if number:
+            live, depth = images.halved("intensity", live), images.halved("depth", depth)
+        if level.passes:
+            pairs.append(_Pair(level, images.sampled(live, depth)))
+    return pairs
+
+
+def align(kernels: Kernels, frame: Frame, view: CudaReferenceView, guess: Pose, config: AlignmentConfig) -> Alignment:
     """As `alignment.align`, with all images on a GPU; the host waits once, for what was found.
 
     Args:
         kernels: Of `alignment_text`, for that GPU.
-        frame: The live frame.
-        rendering: The map seen from `T_map_ref` with the frame's camera.
-        weight: W_tr of Eq. 18 at every rendered pixel.
-        T_map_ref: Pose of the rendered view, and the guess to start from; on the CPU.
+        frame: The live frame, of the view's camera.
+        view: Of the map, from somewhere near.
+        guess: `T_map_cam` to start from; on the CPU.
         config: Constants.
     """
     images = _Images(kernels)
-    levels, solid_points = _levels(images, frame, rendering, weight, config)
-    finest, start = levels[0], _start(frame.depth.device)
-    state, last = start.clone(), start.new_zeros(cpu_kernels.SUMS)
-    for level in reversed(levels):
-        state[_COLOR_SCALE : _DONE + 1] = start[_COLOR_SCALE : _DONE + 1]
-        for _ in range(level.passes):
-            last = images.passed(level, state, config, balance=config.depth_weight, moves=True, finest=level is finest)
+    pairs = _pairs(images, frame, view)
+    finest, start = pairs[0], _photometry(frame.depth.device)
+    T_live_ref = (se3.inverse(guess) @ view.T_map_ref).to(start.device, non_blocking=True)
+    state, last = torch.cat((T_live_ref.flatten(), start)), start.new_zeros(cpu_kernels.SUMS)
+    for pair in reversed(pairs):
+        state[_COLOR_SCALE : _DONE + 1] = start[_COLOR_SCALE - _GAIN : _DONE + 1 - _GAIN]
+        for _ in range(pair.level.passes):
+            last = images.passed(pair, state, config, balance=config.depth_weight, moves=True, finest=pair is finest)
     at_rest = {"moves": False, "finest": True}
     color = images.passed(finest, state, config, balance=0.0, **at_rest)
     both = images.passed(finest, state, config, balance=1.0, **at_rest)
-    on_solid = _Level(0, solid_points, finest.live, finest.camera, finest.gate)
+    on_solid = replace(finest, level=replace(finest.level, points=view.solid_points))
     solid = images.passed(on_solid, state, config, balance=config.depth_weight, **at_rest)
-    count = (finest.points[cpu_kernels.PZ] != 0).sum().double()[None]
+    count = (finest.level.points[cpu_kernels.PZ] != 0).sum().double()[None]
     told = torch.cat((state, last, color, both, solid, count)).cpu().numpy()
     state_found, *sums, points = np.split(told, np.cumsum([_STATE, *[cpu_kernels.SUMS] * 4]))
     return concluded(
-        T_map_ref,
+        view.T_map_ref,
         state_found[_POSE:_GAIN].reshape(4, 4),
         int(state_found[_PASSES]),
         Photometry(*state_found[_GAIN:_DONE].tolist()),

@@ -14,13 +14,23 @@ from tcgsplat.confidence import equations as eq
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
+from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import Rendering, SubmapView, render_view
 from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, Equations, align, correlation
+from tcgsplat.tracking import cuda_alignment
+from tcgsplat.tracking.alignment import (
+    AlignmentConfig,
+    Equations,
+    ReferenceView,
+    align,
+    correlation,
+    reference_view,
+)
+from tcgsplat.tracking.cuda_alignment import CudaReferenceView
 from tcgsplat.tracking.descent import DescentConfig, descend
 from tcgsplat.tracking.pyramids import luma
 
@@ -40,6 +50,11 @@ class TrackerConfig:
     exposure: bool = True
     """Whether the map keeps one brightness and every picture its exposure beside it, as `alignment` finds it; else
     pictures are mapped as they come. [ours]"""
+    view_distance: float = 0.02
+    """`alignment`: metres between a frame's guess and where the map was rendered, up to which it is aligned to that
+    view. Half as far again changed no trajectory by a tenth; from 5 cm and degrees on, frames were lost. [ours]"""
+    view_angle: float = 2.0
+    """`alignment`: the same, degrees. [ours]"""
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
     descent: DescentConfig = field(default_factory=DescentConfig)
     max_step: float = 0.3
@@ -63,6 +78,9 @@ class TrackerConfig:
         for name in ("max_step", "max_turn"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"tracker.{name} is {getattr(self, name)!r}; it must be above 0")
+        for name in ("view_distance", "view_angle"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"tracker.{name} is {getattr(self, name)!r}; it must be at least 0")
 
 
 @dataclass(frozen=True)
@@ -117,7 +135,8 @@ class Tracker:
         self._config = config
         self._floor = confidence.tracking_floor if confidence.guide_tracking else None
         self._rasterizer = rasterizer
-        self._view: SubmapView | None = None
+        self._drawing: SubmapView | None = None
+        self._view: ReferenceView | CudaReferenceView | None = None
 
     def track(self, frame: Frame, submap: Submap, guess: Pose) -> Tracked:
         """Pose of `frame` in `submap`, starting from `guess` (`T_map_cam`).
@@ -131,40 +150,57 @@ class Tracker:
             rendering = render_view(submap, frame.camera, found.T_map_cam, self._rasterizer)
             compared = _compared(rendering, frame, self._config.alignment.gate)
             return self._believed(guess, Tracked(found.T_map_cam, "", found.iterations, *compared))
-        aligned = self._aligned(frame, self._view_of(submap)(frame.camera, guess), guess)
+        kept = self._kept_view(submap, frame.camera, guess)
+        tracked = None if kept is None else self._aligned(frame, kept, guess)
+        if tracked is None or not tracked.converged:
+            self._view = self._reference_view(submap, frame.camera, guess)
+            tracked = self._aligned(frame, self._view, guess)
+        return tracked
+
+    def _kept_view(self, submap: Submap, camera: Camera, guess: Pose) -> ReferenceView | CudaReferenceView | None:
+        """The last one, if it is of this map and from near the guess."""
+        view, config = self._view, self._config
+        if view is None or self._drawing is None or self._drawing.submap is not submap or view.camera != camera:
+            return None
+        T_ref_guess = se3.inverse(view.T_map_ref) @ guess
+        turned = math.degrees(se3.rotation_angle(T_ref_guess))
+        near = se3.translation_norm(T_ref_guess) <= config.view_distance and turned <= config.view_angle
+        return view if near else None
+
+    def _aligned(self, frame: Frame, view: ReferenceView | CudaReferenceView, guess: Pose) -> Tracked:
+        """By the solver where the view is, on a GPU or on the CPU."""
+        if isinstance(view, ReferenceView):
+            found = align(frame.cpu(), view, guess, self._config.alignment)
+        else:
+            device = view.solid_points.device
+            kernels = cuda_alignment.alignment_kernels(device)
+            found = cuda_alignment.align(kernels, frame.to(device), view, guess, self._config.alignment)
         tracked = Tracked(
-            aligned.T_map_cam,
-            iterations=aligned.iterations,
-            overlap=aligned.overlap,
-            agreement=aligned.agreement,
-            correlation=aligned.correlation,
-            exposure=aligned.exposure if self._config.exposure else UNCHANGED,
-            color=aligned.color,
-            depth=aligned.depth,
+            found.T_map_cam,
+            iterations=found.iterations,
+            overlap=found.overlap,
+            agreement=found.agreement,
+            correlation=found.correlation,
+            exposure=found.exposure if self._config.exposure else UNCHANGED,
+            color=found.color,
+            depth=found.depth,
         )
         return self._believed(guess, tracked)
 
-    def _aligned(self, frame: Frame, rendering: Rendering, guess: Pose) -> Alignment:
-        """By the solver where the rendering is, if it is on a GPU, else on the CPU."""
-        on_gpu = rendering.alpha.is_cuda
-        if not on_gpu:
-            frame, rendering = frame.cpu(), rendering.cpu()
+    def _reference_view(self, submap: Submap, camera: Camera, T_map_ref: Pose) -> ReferenceView | CudaReferenceView:
+        """The map seen from there: on a GPU if it is drawn there, else on the CPU."""
+        if self._drawing is None or self._drawing.submap is not submap:
+            self._drawing = SubmapView(submap, self._rasterizer)
+        rendering = self._drawing(camera, T_map_ref)
+        rendering = rendering if rendering.alpha.is_cuda else rendering.cpu()
         if self._floor is None:
             weight = torch.ones_like(rendering.confidence)
         else:
             weight = eq.tracking_weight(rendering.confidence, floor=self._floor)
-        if not on_gpu:
-            return align(frame, rendering, weight, guess, self._config.alignment)
-        from tcgsplat.tracking import cuda_alignment  # noqa: PLC0415  a CPU needs none of it
-
-        kernels, frame = cuda_alignment.alignment_kernels(rendering.alpha.device), frame.to(rendering.alpha.device)
-        return cuda_alignment.align(kernels, frame, rendering, weight, guess, self._config.alignment)
-
-    def _view_of(self, submap: Submap) -> SubmapView:
-        """Frame after frame is tracked against one submap."""
-        if self._view is None or self._view.submap is not submap:
-            self._view = SubmapView(submap, self._rasterizer)
-        return self._view
+        if not rendering.alpha.is_cuda:
+            return reference_view(rendering, weight, camera, T_map_ref, self._config.alignment)
+        kernels = cuda_alignment.alignment_kernels(rendering.alpha.device)
+        return cuda_alignment.reference_view(kernels, rendering, weight, camera, T_map_ref, self._config.alignment)
 
     def _believed(self, guess: Pose, found: Tracked) -> Tracked:
         """The solver's answer, or the guess and the reason why not."""
