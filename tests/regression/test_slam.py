@@ -131,7 +131,8 @@ class TestLag:
         """Not where the map that is a lag old has it, which the frames before were tracked against."""
         config = replace(
             CONFIG,
-            tracker=replace(CONFIG.tracker, synchronization="none", smoothing=False),  # frames as they come
+            # Frames as they come, and none aligned to the view that was drawn for another.
+            tracker=replace(CONFIG.tracker, synchronization="none", smoothing=False, view_distance=0.0),
             schedule=replace(CONFIG.schedule, submap_by="interval", submap_interval=6),
             confidence=replace(CONFIG.confidence, guide_tracking=False),  # sealing changes confidence
         )
