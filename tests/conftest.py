@@ -64,7 +64,7 @@ def corner(rasterizer: Rasterizer) -> Submap:
     mapper = Mapper(config, ConfidenceConfig(), rasterizer, IdSource(), torch.Generator().manual_seed(0))
     frame = Room().frame()
     mapped = mapper.optimized(mapper.grown(Keyframe(frame, se3.identity()), Submap.anchored(se3.identity(), index=0)))
-    return judged(mapped, frame, ConfidenceConfig(), "planar")
+    return judged(mapped, frame, ConfidenceConfig(), "planar", rasterizer)
 
 
 @pytest.fixture(scope="session")

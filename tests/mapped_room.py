@@ -34,5 +34,5 @@ def mapped(
     for number, T in enumerate(T_world_cam):
         frame = room.frame(T, 100 * index + number, CAMERA)
         grown = mapper.grown(Keyframe(frame, se3.inverse(T_world_cam[0]) @ T), submap)
-        submap = judged(mapper.optimized(grown), frame, confidence, config.depth_mode)
+        submap = judged(mapper.optimized(grown), frame, confidence, config.depth_mode, rasterizer)
     return submap

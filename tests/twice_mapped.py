@@ -24,7 +24,7 @@ def twice_mapped(
     submap = Submap.anchored(se3.identity(), 0, config.sh_degree, rasterizer.device)
     for index, T in enumerate((pose(), pose(-0.1, 0.05, -0.3, degrees=(0, 14, 0)))):
         grown = mapper.grown(Keyframe(Room().frame(T, index, camera=camera), T), submap)
-        submap = judged(mapper.optimized(grown), grown.frame, confidence, config.depth_mode)
+        submap = judged(mapper.optimized(grown), grown.frame, confidence, config.depth_mode, rasterizer)
     return submap
 
 

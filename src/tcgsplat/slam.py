@@ -24,10 +24,12 @@ from tcgsplat.loop.relocalization import Relocalized
 from tcgsplat.mapping.completion import completed
 from tcgsplat.mapping.feedback import judged
 from tcgsplat.mapping.mapper import Grown, Mapper
+from tcgsplat.mapping.optimization import never
 from tcgsplat.mapping.schedule import Schedule
 from tcgsplat.mapping.seeding import IdSource
+from tcgsplat.priority import step_back
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.render.view import Rendering, render_view
+from tcgsplat.render.view import render_view
 from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
@@ -117,8 +119,9 @@ class Slam:
         Args:
             config: All settings.
             rasterizer: Backend of tracking and mapping.
-            live: Never wait for the map: it comes into use when it is ready, and nothing new is mapped before. For a
-                camera that does not wait either; what comes out then depends on the machine's speed.
+            live: Never wait for the map: it grows beside tracking, is optimised until the next frame is due to be
+                mapped, and comes into use when it is ready. For a camera that does not wait either; what comes out
+                then depends on the machine's speed.
             store: Where finished submaps go, and are read back from when their place is seen again; if left out,
                 memory.
             mapper: Makes the mapper, of the arguments of `Mapper`: for experiments with another one.
@@ -134,10 +137,12 @@ class Slam:
         self._closer = LoopCloser(
             config.loop, config.tracker, config.confidence, rasterizer, self._store.load_submap, config.seed
         )
-        self._mapping_thread = ThreadPoolExecutor(1, thread_name_prefix="mapping")
+        behind = step_back if live else None  # a camera's next frame does not wait
+        self._mapping_thread = ThreadPoolExecutor(1, thread_name_prefix="mapping", initializer=behind)
+        self._growing: Future[Grown] | None = None
         self._updating: Future[tuple[Submap, MapUpdate]] | None = None
         self._since_mapped = 0
-        self._keeping_thread = ThreadPoolExecutor(1, thread_name_prefix="keeping")
+        self._keeping_thread = ThreadPoolExecutor(1, thread_name_prefix="keeping", initializer=behind)
         self._keeping: deque[Future[Closure]] = deque()
         self._since_sealed = 0
         self._resumed_at: int | None = None
@@ -179,6 +184,8 @@ class Slam:
 
         # The map that was optimised meanwhile comes into use, and the submaps stand where comparing the last one with
         # those before has shown them to be: after as many frames on a slow machine as on a fast one.
+        if self._growing is not None and self._growing.done():
+            self._take_growth()
         update = self._finished_update() if self._adopts_update else None
         closure = self._finished_closure() if self._adopts_closure else None
         clock.lap("wait")
@@ -219,15 +226,14 @@ class Slam:
         if maps:
             update = self._finished_update() or update
             clock.lap("wait")
-            with self._core():
-                keyframe = Keyframe(self._synchronized(frame), T_map_cam, exposure.relaxed(EXPOSURE_LEAK))
-                grown = self._mapper.grown(keyframe, self.submap, self._known(keyframe))
-            self.submap, self._since_mapped = grown.submap, 0
-            if not grown.first or not len(self.reference.submap):
-                self._refer_to(self.submap)
-            self._updating = self._mapping_thread.submit(self._updated, grown)
+            keyframe = Keyframe(self._synchronized(frame), T_map_cam, exposure.relaxed(EXPOSURE_LEAK))
+            self._growing = self._mapping_thread.submit(self._grown, keyframe, self.submap, self.reference)
+            self._updating = self._mapping_thread.submit(self._updated, self._growing)
+            self._since_mapped = 0
+            if not self._live or not len(self.reference.submap):
+                self._take_growth()
             clock.lap("grow")
-            raw = grown.first and self.reference.submap is self.submap  # one picture's seeds are all there is
+            raw = len(self.submap.keyframes) == 1 and self.reference.submap is self.submap  # seeds are all there is
             if (raw or self.config.schedule.map_lag == 0) and not self._live:
                 update = self._finished_update()
                 clock.lap("wait")
@@ -273,9 +279,10 @@ class Slam:
         Nothing is computed on the device any more: an update under way is given up, and the submap is kept as it was
         before that, or was seeded, with its holes open, and compared with none.
         """
-        if self._updating is not None:
-            self._updating.exception()  # waits, and raises nothing
-            self._updating = None
+        for under_way in (self._growing, self._updating):
+            if under_way is not None:
+                under_way.exception()  # waits, and raises nothing
+        self._growing = self._updating = None
         self._keeping = deque(keeping for keeping in self._keeping if keeping.exception() is None)
         self._finished_closure()
         if not self.submap.keyframes:
@@ -367,22 +374,39 @@ class Slam:
         self._store.keep(whole, checkpoint)
         return self._closer.closed(sealed.index, edge) if self.config.loop.enabled else Closure(sealed.index)
 
-    def _known(self, keyframe: Keyframe) -> Rendering | None:
-        """What the submap before shows of the view that a submap begins with: its own map shows nothing yet."""
-        before = self.reference
-        if self.submap.keyframes or not len(before.submap) or self.config.confidence.model == "paper":
-            return None
-        T_reference_cam = se3.inverse(before.T_map_reference) @ keyframe.T_map_cam
-        return render_view(before.submap, keyframe.frame.camera, T_reference_cam, self._rasterizer)
+    def _grown(self, keyframe: Keyframe, submap: Submap, before: Reference) -> Grown:
+        """The submap with a keyframe taken in, and seeds where that shows something new.
 
-    def _updated(self, grown: Grown) -> tuple[Submap, MapUpdate]:
+        The view that a submap begins with is compared with what the one before shows of it: its own map shows nothing.
+        """
+        known = None
+        if not submap.keyframes and len(before.submap) and self.config.confidence.model != "paper":
+            T_reference_cam = se3.inverse(before.T_map_reference) @ keyframe.T_map_cam
+            known = render_view(before.submap, keyframe.frame.camera, T_reference_cam, self._rasterizer)
+        return self._mapper.grown(keyframe, submap, known)
+
+    def _updated(self, growing: Future[Grown]) -> tuple[Submap, MapUpdate]:
         """Optimise (equations 20 to 24), then judge what moved (equations 4 to 15); runs beside tracking."""
-        started = time.perf_counter()
-        mapped = self._mapper.optimized(grown)
-        submap = judged(mapped, grown.frame, self.config.confidence, self.config.mapper.depth_mode)
+        grown, started = growing.result(), time.perf_counter()
+        mapped = self._mapper.optimized(grown, self._maps_soon if self._live else never)
+        config = self.config
+        submap = judged(mapped, grown.frame, config.confidence, config.mapper.depth_mode, self._rasterizer)
         seconds = time.perf_counter() - started
         frame_index = grown.submap.keyframes[-1].frame.index
         return submap, MapUpdate(frame_index, grown.seeded, mapped.pruned, mapped.loss, seconds)
+
+    def _maps_soon(self) -> bool:
+        """Whether a frame is due to be mapped, for which the update under way makes room."""
+        return self._schedule.due(self._since_mapped)
+
+    def _take_growth(self) -> None:
+        """Wait for the map that is growing, if any, and use it from now on, not yet optimised."""
+        if self._growing is None:
+            return
+        grown, self._growing = self._growing.result(), None
+        self.submap = grown.submap
+        if not grown.first or not len(self.reference.submap):
+            self._refer_to(self.submap)
 
     @property
     def _updates(self) -> bool:
@@ -409,6 +433,7 @@ class Slam:
 
     def _finished_update(self) -> MapUpdate | None:
         """Wait for the update that is under way, if any, and use its map from now on."""
+        self._take_growth()
         if self._updating is None:
             return None
         self.submap, update = self._updating.result()

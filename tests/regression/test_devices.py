@@ -127,7 +127,8 @@ def test_a_submap_grows_as_on_the_cpu(
         submap = Submap.anchored(se3.identity(), 0, config.sh_degree, rasterizer.device)
         for index, T in enumerate((pose(), pose(0.05, 0.02, degrees=(0, 12, 0)), pose(0.02, 0.0, 0.03))):
             mapped = mapper.optimized(mapper.grown(Keyframe(room.frame(T, index), T), submap))
-            submap = judged(mapped, mapped.submap.keyframes[-1].balanced, confidence, config.depth_mode)
+            frame = mapped.submap.keyframes[-1].balanced
+            submap = judged(mapped, frame, confidence, config.depth_mode, rasterizer)
         submaps.append(submap)
     assert submaps[1].device == DEVICE and submaps[1].keyframes[0].frame.color.device == DEVICE
     assert_same(submaps[1], submaps[0])
@@ -139,7 +140,8 @@ def experienced(config: MapperConfig, confidence: ConfidenceConfig, room: Room, 
     submap = Submap.anchored(se3.identity(), 0, config.sh_degree, DEVICE)
     for index in range(2):
         mapped = mapper.optimized(mapper.grown(Keyframe(room.frame(index=index), pose()), submap))
-        submap = judged(mapped, mapped.submap.keyframes[-1].balanced, confidence, config.depth_mode)
+        frame = mapped.submap.keyframes[-1].balanced
+        submap = judged(mapped, frame, confidence, config.depth_mode, distant)
     return submap
 
 

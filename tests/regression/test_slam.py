@@ -1,5 +1,8 @@
 """The whole online system on the room: where the camera went, what was mapped, and what must never matter."""
 
+import sys
+import threading
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 
@@ -12,14 +15,17 @@ from tcgsplat.config import SlamConfig, with_settings
 from tcgsplat.datasets.sequence import Sequence
 from tcgsplat.geometry import se3
 from tcgsplat.loop.settings import LoopConfig
+from tcgsplat.mapping.mapper import Grown, Mapped, Mapper
+from tcgsplat.mapping.optimization import Enough, never
 from tcgsplat.mapping.schedule import ScheduleConfig
 from tcgsplat.mapping.seeding import SeedingConfig
 from tcgsplat.mapping.settings import MapperConfig
+from tcgsplat.priority import niceness
 from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.render.view import render_view
+from tcgsplat.render.view import Rendering, render_view
 from tcgsplat.scene.frame import Frame
-from tcgsplat.scene.submap import Submap
+from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.slam import Slam, StepReport
 from tcgsplat.tensors import Pose
 from tcgsplat.tracking.alignment import AlignmentConfig
@@ -192,11 +198,18 @@ class TestReference:
             assert errors(T, true)[0] < 15
 
 
+def filmed(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """With time between them, in which the map can be worked on however busy the machine is otherwise."""
+    for frame in frames:
+        yield frame
+        time.sleep(0.05)
+
+
 class TestLive:
     def test_a_live_system_maps_when_it_can(self, rasterizer: Rasterizer) -> None:
         """Whatever its speed, one update is worked on at a time, none is lost, and the camera is where it was."""
         slam = Slam(CONFIG, rasterizer, live=True)
-        reports = [slam.step(frame) for frame in SEQUENCE]
+        reports = [slam.step(frame) for frame in filmed(SEQUENCE)]
         slam.finish()
         begun = [report.frame_index for report in reports if report.mapped]
         used = [report.update.frame_index for report in reports if report.update]
@@ -204,6 +217,31 @@ class TestLive:
         assert len(begun) >= 2
         off = [errors(T, true) for T, true in zip(slam.trajectory.world(slam.atlas), SEQUENCE.T_world_cam, strict=True)]
         assert max(millimetres for millimetres, _ in off) < 20
+
+    def test_tracking_comes_first_and_the_map_makes_room_for_the_next_frame(self, rasterizer: Rasterizer) -> None:
+        """The map is grown and optimised by a nicer thread, and not to the end when a frame is due to be mapped."""
+        threads, over = set[tuple[str, int]](), threading.Event()
+
+        class Seen(Mapper):
+            def grown(self, keyframe: Keyframe, submap: Submap, known: Rendering | None = None) -> Grown:
+                threads.add((threading.current_thread().name.split("_")[0], niceness()))
+                return super().grown(keyframe, submap, known)
+
+            def optimized(self, grown: Grown, enough: Enough = never) -> Mapped:
+                threads.add((threading.current_thread().name.split("_")[0], niceness()))
+                while not (enough() or over.is_set()):  # as if it took that long
+                    time.sleep(0.001)
+                return super().optimized(grown, enough)
+
+        slam = Slam(CONFIG, rasterizer, live=True, mapper=Seen)
+        used = dict[int, int]()
+        for frame in filmed(SEQUENCE):
+            report = slam.step(frame)
+            used |= {report.update.frame_index: frame.index} if report.update else {}
+        over.set()
+        slam.finish()
+        assert threads == {("mapping", niceness() + 5 if sys.platform == "linux" else 0)}
+        assert len(used) >= 2 and all(later >= begun + CONFIG.schedule.map_every for begun, later in used.items())
 
 
 class TestSubmaps:

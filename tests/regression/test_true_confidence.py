@@ -73,7 +73,8 @@ def told(model: str, rasterizer: Rasterizer, *, still: bool, seed: int = 1) -> l
             error = (view.depth - exact.depth).abs()[mapped].double().numpy()
             found.append(spearman(doubt, error))
         frame = measured(exact, draw)
-        submap = judged(mapper.optimized(mapper.grown(Keyframe(frame, T), submap)), frame, confidence, "planar")
+        grown = mapper.grown(Keyframe(frame, T), submap)
+        submap = judged(mapper.optimized(grown), frame, confidence, "planar", rasterizer)
     assert np.isfinite(found).all()
     return found
 

@@ -324,12 +324,12 @@ class TestFrames:
 
     def test_an_empty_map_has_nothing_to_learn(self, rasterizer: Rasterizer) -> None:
         born = grown(Submap.anchored(se3.identity(), 0), Room().frame(), se3.identity(), rasterizer)
-        assert born.first and born.rendering is None and len(born.before) == 0
-        assert experienced(born, DEFAULT, rasterizer) is born.submap
+        assert born.first and born.view is None and len(born.before) == 0
+        assert experienced(born, DEFAULT) is born.submap
 
     def test_the_papers_model_learns_nothing_from_a_frame(self, corner: Submap, rasterizer: Rasterizer) -> None:
         update = grown(corner, Room().frame(T_SIDE), T_SIDE, rasterizer, replace(DEFAULT, model="paper"))
-        assert experienced(update, replace(DEFAULT, model="paper"), rasterizer) is update.submap
+        assert experienced(update, replace(DEFAULT, model="paper")) is update.submap
         assert (
             update.submap.confidence.value[len(corner) :] == torch.tensor(replace(DEFAULT, model="paper").initial)
         ).all()
@@ -343,7 +343,7 @@ class TestFrames:
         wrong = replace(frame, depth=torch.where(patch, frame.depth + 0.2, frame.depth))
         update = grown(corner, wrong, T_SIDE, rasterizer)
         before = update.submap.confidence
-        after = experienced(update, DEFAULT, rasterizer).confidence
+        after = experienced(update, DEFAULT).confidence
         hit = within(update.before, T_SIDE, (32, 22), (47, 32))
         clear = within(update.before, T_SIDE, (2, 2), (77, 57)) & ~within(update.before, T_SIDE, (27, 17), (52, 37))
         n = len(corner)
@@ -357,7 +357,7 @@ class TestFrames:
     ) -> None:
         T_far = pose(0.05, 0.02, 0.0, degrees=(0, 25, 0))
         update = grown(corner, Room().frame(T_far), T_far, rasterizer)
-        after, n = experienced(update, DEFAULT, rasterizer), len(corner)
+        after, n = experienced(update, DEFAULT), len(corner)
         assert update.seeded > 300 and len(after) == n + update.seeded
         for name, column in columns(update.submap.confidence).items():
             assert torch.equal(getattr(after.confidence, name)[n:], column[n:])
@@ -368,13 +368,13 @@ class TestFrames:
         frame = Room().frame(T_SIDE)
         blind = replace(frame, **{what: torch.zeros_like(getattr(frame, what))})
         update = grown(corner, blind, T_SIDE, rasterizer)
-        assert same(experienced(update, DEFAULT, rasterizer).confidence, update.submap.confidence)
+        assert same(experienced(update, DEFAULT).confidence, update.submap.confidence)
 
     def test_no_error_counts_for_more_than_the_largest(self, corner: Submap, rasterizer: Rasterizer) -> None:
         frame = Room().frame(T_SIDE)
         unknown = replace(corner, confidence=replace(corner.confidence, evidence=torch.zeros(len(corner))))
         update = grown(unknown, replace(frame, depth=frame.depth + 50.0), T_SIDE, rasterizer)
-        state = experienced(update, DEFAULT, rasterizer).confidence
+        state = experienced(update, DEFAULT).confidence
         assert state.expected_error.max() <= DEFAULT.error_max * (1 + 1e-5)
         assert state.expected_error[: len(corner)].max() > 0.9 * DEFAULT.error_max
 
@@ -382,7 +382,7 @@ class TestFrames:
         """Optimising towards the frame afterwards does not take back what was found."""
         frame = Room().frame(T_SIDE)
         update = grown(corner, replace(frame, depth=frame.depth * 1.05), T_SIDE, rasterizer)
-        state = experienced(update, DEFAULT, rasterizer).confidence
+        state = experienced(update, DEFAULT).confidence
         mapper = Mapper(
             MapperConfig(iterations=20, depth_mode="planar", min_opacity=0.0, complete=False),
             DEFAULT,

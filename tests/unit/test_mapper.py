@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable
 from dataclasses import fields, replace
+from itertools import chain, repeat
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.mapper import Mapped, Mapper
-from tcgsplat.mapping.optimization import self_distance
+from tcgsplat.mapping.optimization import begin, self_distance
 from tcgsplat.mapping.optimizer import LearningRates
 from tcgsplat.mapping.seeding import IdSource, SeedingConfig
 from tcgsplat.mapping.settings import MapperConfig
@@ -162,6 +163,25 @@ class TestOptimisation:
         assert all(getattr(update.submap.gaussians, f.name).isfinite().all() for f in fields(update.submap.gaussians))
 
 
+class TestEnough:
+    @pytest.mark.parametrize(("answers", "steps"), [((True,), 4), ((False, True), 5), ((False,), 6)])
+    def test_half_of_the_steps_are_made_in_any_case(
+        self, answers: tuple[bool, ...], steps: int, rasterizer: Rasterizer
+    ) -> None:
+        config = replace(CONFIG, first_iterations=6)
+        mapper = Mapper(config, UNGUIDED, rasterizer, IdSource(), torch.Generator().manual_seed(0))
+        grown = mapper.grown(Keyframe(Room().frame(), se3.identity()), Submap.anchored(se3.identity(), 0))
+        asked = chain(answers, repeat(answers[-1]))
+        found = mapper.optimized(grown, lambda: next(asked)).submap.gaussians
+
+        expected = begin(grown.submap, config, UNGUIDED, rasterizer)
+        expected.steps([0] * 3)
+        expected.prune()
+        expected.steps([0] * (steps - 3))
+        expected.prune()
+        assert torch.equal(found.means, expected.submap().gaussians.means)
+
+
 class TestBookkeeping:
     def test_the_first_update(self, rasterizer: Rasterizer) -> None:
         update = mapped(rasterizer, first_id=0)
@@ -170,8 +190,6 @@ class TestBookkeeping:
         assert len(update.submap.keyframes) == 1
         assert update.submap.clock == 0  # judging ticks it
         torch.testing.assert_close(update.submap.confidence.value, torch.full((len(update.submap),), 0.3))
-        expected = render_view(update.submap, CAMERA, se3.identity(), rasterizer)
-        assert torch.equal(update.rendering.color, expected.color)
 
     def test_a_later_update_grows_where_the_view_is_new(
         self, room: Room, young: Submap, rasterizer: Rasterizer
@@ -224,7 +242,6 @@ class TestBookkeeping:
     def test_a_map_that_fades_away_is_no_trouble(self, young: Submap, rasterizer: Rasterizer) -> None:
         update = mapped(rasterizer, young, min_opacity=0.9999)
         assert len(update.submap) == len(update.submap.confidence) == 0
-        assert not update.rendering.alpha.any()
 
     def test_keyframes_are_bounded(self, young: Submap, rasterizer: Rasterizer) -> None:
         submap = young

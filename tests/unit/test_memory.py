@@ -19,6 +19,7 @@ from tcgsplat.geometry.camera import Camera
 from tcgsplat.mapping import memory
 from tcgsplat.mapping.mapper import Grown, Mapped, Mapper
 from tcgsplat.mapping.memory import LEAST, MemoryLimit, most_useful, paged
+from tcgsplat.mapping.optimization import Enough, never
 from tcgsplat.mapping.seeding import IdSource, SeedingConfig
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer
@@ -159,11 +160,11 @@ class ShortMapper(Mapper):
 
     updates = 0
 
-    def optimized(self, grown: Grown) -> Mapped:
+    def optimized(self, grown: Grown, enough: Enough = never) -> Mapped:
         self.updates += 1
         if self.updates == 3:
             raise torch.OutOfMemoryError("CUDA out of memory.")
-        return super().optimized(grown)
+        return super().optimized(grown, enough)
 
 
 def run_directory(path: Path) -> RunDirectory:
@@ -219,7 +220,7 @@ def test_a_run_that_ran_out_says_what_is_kept_and_goes_on_from_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     synthesize(tmp_path / "rooms", SynthConfig(150, width=80, height=60, free_views=0), lambda *_: None)
-    out, drawn, left = tmp_path / "out", NumbaRasterizer.__call__, iter(range(40))
+    out, drawn, left = tmp_path / "out", NumbaRasterizer.__call__, iter(range(20))
     arguments = ["run", str(tmp_path / "rooms"), "--limit", "20", "--out", str(out)]
     arguments += ["--schedule.submap-by", "interval", "--schedule.submap-interval", "8", "--max-gpu-memory", "1.5"]
 

@@ -295,6 +295,17 @@ class ConfidenceState:
         seen = observation.valid & ~distance.isnan() & ~residual.isnan()  # one NaN in p would never leave the map
         first = self.updates == 0
 
+        averaged = eq.update_baseline(self.baseline, distance, rate=config.baseline_rate)
+        return replace(
+            self,
+            value=self._judged(observation, seen, config) if config.model == "paper" else self.value,
+            baseline=torch.where(seen, torch.where(first, distance, averaged), self.baseline),
+            updates=self.updates + seen,
+        )
+
+    def _judged(self, observation: Observation, seen: PerGaussianFlag, config: ConfidenceConfig) -> PerGaussian:
+        """The paper's confidence after an observation (Eqs. 4, 10 to 15)."""
+        distance, residual, first = observation.distance, observation.residual, self.updates == 0
         decayed = eq.decay(self.value, decay_time=config.decay_time, p_min=config.p_min)
         quality = eq.observation_quality(residual, residual_ref=config.residual_ref)
         stability = eq.relative_stability(self.baseline, distance, scale=config.stability_scale)
@@ -311,13 +322,7 @@ class ConfidenceState:
             rate=config.update_rate,
             p_min=config.p_min,
         )
-        averaged = eq.update_baseline(self.baseline, distance, rate=config.baseline_rate)
-        return replace(
-            self,
-            value=torch.where(seen, judged, decayed) if config.model == "paper" else self.value,
-            baseline=torch.where(seen, torch.where(first, distance, averaged), self.baseline),
-            updates=self.updates + seen,
-        )
+        return torch.where(seen, judged, decayed)
 
     @torch.no_grad()
     def sealed(self, config: ConfidenceConfig) -> "ConfidenceState":

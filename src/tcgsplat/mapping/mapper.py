@@ -14,11 +14,11 @@ from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
 from tcgsplat.mapping.keyframes import thinned
 from tcgsplat.mapping.memory import MemoryLimit, most_useful, paged
-from tcgsplat.mapping.optimization import Optimization, begin
+from tcgsplat.mapping.optimization import Enough, Optimization, begin, never
 from tcgsplat.mapping.seeding import IdSource, seed
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.render.view import MIN_COVERAGE, Rendering, blended, render_view
+from tcgsplat.render.view import MIN_COVERAGE, Blend, Rendering, blend
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Keyframe, Submap
@@ -38,8 +38,8 @@ class Grown:
     """It is the submap's first frame."""
     before: Submap
     """As it was before it took in the frame."""
-    rendering: Rendering | None
-    """The frame's view of that; None of an empty map."""
+    view: Blend | None
+    """The frame's of that; None of a submap that is new."""
 
     @property
     def frame(self) -> Frame:
@@ -57,8 +57,6 @@ class Mapped:
     """Optimised and pruned; confidence not yet judged."""
     distance: PerGaussian
     """How far each Gaussian of the submap has moved in this update (Eq. 8), metres."""
-    rendering: Rendering
-    """The newest keyframe's view of the optimised submap."""
     loss: float
     """Eq. 21 at the last step."""
 
@@ -99,7 +97,8 @@ class Mapper:
         """
         keyframe = keyframe.to(self._rasterizer.device)
         first, frame, T_map_cam = not submap.keyframes, keyframe.balanced, keyframe.T_map_cam
-        rendering = None if first else render_view(submap, frame.camera, T_map_cam, self._rasterizer)
+        view = None if first else blend(submap, frame.camera, T_map_cam, self._rasterizer)
+        rendering = None if view is None else view.rendering
         seeds = seed(frame, T_map_cam, rendering, submap.gaussians, self._ids, self._generator, self._config.seeding)
         doubt = None
         if self._confidence.model != "paper":
@@ -108,17 +107,22 @@ class Mapper:
         keyframes = thinned((*submap.keyframes, keyframe), self._config.max_keyframes)
         grown = replace(submap.grown(seeds, self._confidence, doubt), keyframes=keyframes)
         grown, before = self._within_memory(grown, submap)
-        return Grown(grown, len(grown) - len(before), first, before, rendering)
+        if view is not None and before is not submap:  # some have gone: the others are told what they are
+            view = blend(before, frame.camera, T_map_cam, self._rasterizer)
+        return Grown(grown, len(grown) - len(before), first, before, view)
 
-    def optimized(self, grown: Grown) -> Mapped:
-        """The grown submap, optimised over its keyframes."""
+    def optimized(self, grown: Grown, enough: Enough = never) -> Mapped:
+        """The grown submap, optimised over its keyframes.
+
+        Args:
+            grown: Not yet optimised.
+            enough: Whether the steps that are left are to be left out; asked from halfway on.
+        """
         iterations = self._config.first_iterations if grown.first else self._config.iterations
-        judged = experienced(grown, self._confidence, self._rasterizer, self.disagreement)
-        optimization = self._optimized(judged, iterations)
+        judged = experienced(grown, self._confidence, self.disagreement)
+        optimization = self._optimized(judged, iterations, enough)
         submap = optimization.submap()
-        newest = submap.keyframes[-1]
-        rendering = render_view(submap, newest.frame.camera, newest.T_map_cam, self._rasterizer)
-        return Mapped(grown.submap.gaussians, submap, optimization.self_distance(), rendering, optimization.loss)
+        return Mapped(grown.submap.gaussians, submap, optimization.self_distance(), optimization.loss)
 
     def birth_error(self, frame: Frame, rendering: Rendering | None) -> Plane:
         """See the function of that name. Who wants to know what a better judge were worth puts another one here."""
@@ -151,7 +155,7 @@ class Mapper:
             self._warned.add(about)
             logger.warning("GPU memory is limited to %g GB: %s", self._config.max_gpu_memory, sentence)
 
-    def _optimized(self, submap: Submap, iterations: int) -> Optimization:
+    def _optimized(self, submap: Submap, iterations: int, enough: Enough) -> Optimization:
         """Adam over drawn keyframes; faint Gaussians are dropped halfway and at the end."""
         optimization = begin(submap, self._config, self._confidence, self._rasterizer)
         views = [self._drawn_view(len(submap.keyframes)) for _ in range(iterations)]
@@ -159,7 +163,10 @@ class Mapper:
         for start, stop in pairwise(sorted({0, half, colored, iterations})):
             if start == half > 0:
                 optimization.prune()
-            optimization.steps(views[start:stop], ("sh",) if start < colored else ())
+            frozen = ("sh",) if start < colored else ()
+            optimization.steps(views[start:stop], frozen, enough=enough if start >= half else never)
+            if stop > half and enough():
+                break
         optimization.prune()
         return optimization
 
@@ -205,7 +212,6 @@ def disagreement(frame: Frame, rendering: Rendering) -> Plane:
 def experienced(
     grown: Grown,
     config: ConfidenceConfig,
-    rasterizer: Rasterizer,
     error: Callable[[Frame, Rendering], Plane] = disagreement,
 ) -> Submap:
     """The grown submap, having been told how far off its older Gaussians were where the frame shows them.
@@ -215,15 +221,13 @@ def experienced(
     Args:
         grown: Not yet optimised.
         config: The model of confidence.
-        rasterizer: Backend.
         error: Of the map in the frame's view, metres; NaN where it is not known.
     """
-    if grown.rendering is None or config.model == "paper":
+    if grown.view is None or config.model == "paper":
         return grown.submap
-    errors = error(grown.frame, grown.rendering).clamp_max(config.error_max)
+    errors = error(grown.frame, grown.view.rendering).clamp_max(config.error_max)
     images = torch.stack((errors.isfinite().to(errors), errors.nan_to_num(0.0)), dim=-1)
-    T_map_cam = grown.submap.keyframes[-1].T_map_cam
-    pixels, total = blended(grown.before, images, grown.frame.camera, T_map_cam, rasterizer).unbind(-1)
+    pixels, total = grown.view.shared_out(images).unbind(-1)
     born = torch.zeros(len(grown.submap) - len(grown.before), device=pixels.device)
     state = grown.submap.confidence.experienced(torch.cat((pixels, born)), torch.cat((total, born)), config)
     return replace(grown.submap, confidence=state)

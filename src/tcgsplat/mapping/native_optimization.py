@@ -91,11 +91,19 @@ class NativeOptimization:
         self._window = ssim_window().numpy()
         self._space = Workspace()
 
-    def steps(self, views: Sequence[int], frozen: tuple[str, ...] = (), paces: Sequence[float] | None = None) -> None:
+    def steps(
+        self,
+        views: Sequence[int],
+        frozen: tuple[str, ...] = (),
+        paces: Sequence[float] | None = None,
+        enough: Callable[[], bool] = lambda: False,
+    ) -> None:
         """See `Optimization`."""
         assert not frozen  # `covers` keeps such settings away
         for view, pace in zip(views, paces or [1.0] * len(views), strict=True):
             self._step(self._view(view), pace)
+            if enough():
+                break
 
     def _step(self, target: _View, pace: float) -> None:
         drawn = self._passes.draw(self._parameters, target.camera, target.T_cam_map)

@@ -4,7 +4,7 @@
 `native_optimization.py` does the same by CPU kernels, without autograd, and is held to it by tests.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
@@ -24,15 +24,30 @@ from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag, Pose
 
+Enough = Callable[[], bool]
+"""Whether an optimisation is to end here, though it could go on."""
+
+
+def never() -> bool:
+    """Each step is made."""
+    return False
+
 
 @runtime_checkable
 class Optimization(Protocol):
     """A submap while it is optimised: mutable, made for one mapping update, dropped after it."""
 
-    def steps(self, views: Sequence[int], frozen: tuple[str, ...] = (), paces: Sequence[float] | None = None) -> None:
+    def steps(
+        self,
+        views: Sequence[int],
+        frozen: tuple[str, ...] = (),
+        paces: Sequence[float] | None = None,
+        enough: Enough = never,
+    ) -> None:
         """At one keyframe after the other follow the gradient of Eq. 21 by one Adam step of every Gaussian in view.
 
-        Parameters named in `frozen` stay; `paces` are factors on the learning rates, one for each step.
+        Parameters named in `frozen` stay; `paces` are factors on the learning rates, one for each step. After each
+        step `enough` is asked, if true no other is made; where they are launched as a whole, all are.
         """
         ...
 
@@ -77,7 +92,13 @@ class AutogradOptimization:
         self._adam = _row_adam(self._before, config.rates)
         self._loss_value = torch.zeros((), dtype=torch.float64, device=rasterizer.device)
 
-    def steps(self, views: Sequence[int], frozen: tuple[str, ...] = (), paces: Sequence[float] | None = None) -> None:
+    def steps(
+        self,
+        views: Sequence[int],
+        frozen: tuple[str, ...] = (),
+        paces: Sequence[float] | None = None,
+        enough: Enough = never,  # noqa: ARG002  all are launched as a whole
+    ) -> None:
         """See `Optimization`; all keyframes have the first one's camera."""
         keyframes, device = self._submap.keyframes, self._rasterizer.device
         poses = torch.stack([se3.inverse(keyframes[view].T_map_cam) for view in views])

@@ -76,8 +76,12 @@ class Schedule:
         """
         if not submap.keyframes:
             return True
-        due = len(submap) == 0 or frames_since >= self.config.map_every
+        due = len(submap) == 0 or self.due(frames_since)
         return due and not self.config.withholds(frame_index)
+
+    def due(self, frames_since: int) -> bool:
+        """Whether as many frames have come since the last one that was mapped as there are between two."""
+        return frames_since >= self.config.map_every
 
     def adopts(self, frames_since: int) -> bool:
         """Whether tracking now uses what the mapping update made that began so many frames ago."""

@@ -7,17 +7,18 @@ there, and one that is on the device gives them there: nobody else need know whe
 for the loops of optimisation, wants everything on the rasterizer's device.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.conventions import MAX_OPACITY
-from tcgsplat.render.protocol import Rasterizer, Splats
+from tcgsplat.render.protocol import Raster, Rasterizer, Splats
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Image, PerGaussian, PerGaussianFlag, Plane, Pose
@@ -117,26 +118,36 @@ class SubmapView:
         return _drawn(splats, camera, T_cam_map, self._rasterizer).to(self.submap.device)
 
 
-def blended(
-    submap: Submap,
-    images: Float[Tensor, "h w c"],
-    camera: Camera,
-    T_map_cam: Pose,
-    rasterizer: Rasterizer,
-) -> Float[Tensor, "n c"]:
-    """For each Gaussian the sum over all pixels of some images, times its weight T alpha in each pixel's blend.
+@dataclass(frozen=True)
+class Blend:
+    """A view of n Gaussians, and which of them is how much of each pixel."""
 
-    This is drawing turned round: what a picture says, handed to those that it shows, and to none that they hide. The
-    images are where the submap is, and so are the sums.
-    """
-    gaussians = submap.gaussians.to(rasterizer.device)
-    features = torch.zeros(len(gaussians), images.shape[-1], device=rasterizer.device, requires_grad=True)
-    opacities = gaussians.opacities.clamp_max(MAX_OPACITY)
+    rendering: Rendering
+    """What it looks like, where the submap is."""
+    _features: Tensor
+    _drawn: Tensor
+
+    def shared_out(self, images: Float[Tensor, "h w c"]) -> Float[Tensor, "n c"]:
+        """For each Gaussian the sum over all pixels of some images, times its weight T alpha in each pixel's blend.
+
+        This is drawing turned round: what a picture says, handed to those that it shows, and to none that they hide.
+        The images, four at most, are where the submap is, and so are the sums.
+        """
+        filled_up = functional.pad(images.to(self._drawn.device), (0, self._drawn.shape[-1] - images.shape[-1]))
+        (shares,) = torch.autograd.grad(self._drawn, self._features, filled_up, retain_graph=True)
+        return shares[:, : images.shape[-1]].to(self.rendering.alpha.device)
+
+
+def blend(submap: Submap, camera: Camera, T_map_cam: Pose, rasterizer: Rasterizer) -> Blend:
+    """Draw a submap from a camera in its frame, so that pixels can be asked what they are made of."""
+    there, T_cam_map = submap.to(rasterizer.device), se3.inverse(T_map_cam)
+    with torch.no_grad():
+        splats = _splats(there.gaussians, there.confidence.value, T_cam_map)
+    asked = replace(splats, features=splats.features.requires_grad_())
     with torch.enable_grad():
-        splats = Splats(gaussians.means, gaussians.quats, gaussians.scales, opacities, features)
-        drawn = rasterizer(splats, camera, se3.inverse(T_map_cam)).features
-    (weighed,) = torch.autograd.grad(drawn, features, images.to(rasterizer.device))
-    return weighed.to(submap.device)
+        raster = rasterizer(asked, camera, T_cam_map)
+    plain = replace(raster, **{f.name: getattr(raster, f.name).detach() for f in fields(raster)})
+    return Blend(_rendering(plain).to(submap.device), asked.features, raster.features)
 
 
 def _splats(gaussians: Gaussians, confidence: PerGaussian, T_cam_map: Pose) -> Splats:
@@ -148,7 +159,10 @@ def _splats(gaussians: Gaussians, confidence: PerGaussian, T_cam_map: Pose) -> S
 
 
 def _drawn(splats: Splats, camera: Camera, T_cam_map: Pose, rasterizer: Rasterizer) -> Rendering:
-    raster = rasterizer(splats, camera, T_cam_map)
+    return _rendering(rasterizer(splats, camera, T_cam_map))
+
+
+def _rendering(raster: Raster) -> Rendering:
     return Rendering(
         color=raster.features[..., :3],
         composited_depth=raster.depth,

@@ -128,8 +128,15 @@ class _Draw(torch.autograd.Function):
         def rows(start: int, count: int) -> Tensor:
             return torch.from_numpy(from_blocks(grads[:, start : start + count])[:n])
 
-        d_log2_opacity = rows(LOG2_OPACITY, 1)[:, 0]
+        asked = ctx.needs_input_grad[2:]
+        d_log2_opacity = rows(LOG2_OPACITY, 1)[:, 0] if asked[3] else None
         return (
-            None, None, rows(MEAN, 3), rows(QUAT, 4), rows(SCALE, 3), d_log2_opacity / (opacities * float(np.log(2))),
-            rows(FEATURE, ctx.channels), torch.from_numpy(d_T).to(ctx.pose_dtype),
-        )  # fmt: skip
+            None,
+            None,
+            rows(MEAN, 3) if asked[0] else None,
+            rows(QUAT, 4) if asked[1] else None,
+            rows(SCALE, 3) if asked[2] else None,
+            None if d_log2_opacity is None else d_log2_opacity / (opacities * float(np.log(2))),
+            rows(FEATURE, ctx.channels) if asked[4] else None,
+            torch.from_numpy(d_T).to(ctx.pose_dtype) if asked[5] else None,
+        )

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
+from tcgsplat import priority
+
 Arguments = tuple[object, ...]
 
 
@@ -21,18 +23,19 @@ class Workers:
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
-        self._door, self._busy = threading.Lock(), Counter[int]()
-        self._helpers = ThreadPoolExecutor(threads - 1, thread_name_prefix="splat") if threads > 1 else None
+        self._door, self._busy = threading.Lock(), Counter[tuple[int, int]]()
+        self._helpers: dict[int, ThreadPoolExecutor] = {}
 
     def together(self, work: Callable[[int], object], threads: int | None = None) -> None:
         """Call `work(0)` here and `work(1)`, `work(2)` ... on helpers; the first exception is raised.
 
-        A helper may come late, when all is done, or never: `work` must share itself out as threads come.
+        A helper may come late, when all is done, or never: `work` must share itself out as threads come. It is as nice
+        to the machine's other threads as the caller.
         """
         with self.reserved():
-            free = self.threads - len(self._busy)
+            pool, free = self._helping(priority.niceness())
             helpers = max(min((threads or self.threads) - 1, free), 0)
-            futures = [self._helpers.submit(work, k + 1) for k in range(helpers)] if self._helpers else []
+            futures = [pool.submit(work, k + 1) for k in range(helpers)]
             try:
                 work(0)
             finally:
@@ -44,9 +47,10 @@ class Workers:
     def reserved(self) -> Iterator[None]:
         """A core for the calling thread while inside: what others share is shared by one thread less.
 
-        More threads than cores would take turns, and in a phase all wait for the one whose turn it is not.
+        More threads than cores would take turns, and in a phase all wait for the one whose turn it is not. A nicer
+        thread than those who share takes nothing from them: the operating system has it wait.
         """
-        me = threading.get_ident()
+        me = priority.niceness(), threading.get_ident()
         with self._door:
             self._busy[me] += 1
         try:
@@ -56,6 +60,13 @@ class Workers:
                 self._busy[me] -= 1
                 if not self._busy[me]:
                     del self._busy[me]
+
+    def _helping(self, niceness: int) -> tuple[ThreadPoolExecutor, int]:
+        """The helpers of callers that are so nice, and how many cores are free for them."""
+        with self._door:
+            if niceness not in self._helpers:  # its threads are as nice as the one that begins them
+                self._helpers[niceness] = ThreadPoolExecutor(max(self.threads - 1, 1), thread_name_prefix="splat")
+            return self._helpers[niceness], self.threads - sum(other <= niceness for other, _ in self._busy)
 
     def share(self, kernel: Callable[..., bool], arguments: Callable[[int], Arguments]) -> None:
         """Run a kernel of phases (see `phases.py`) on all threads, each with its own arguments, until all is done."""

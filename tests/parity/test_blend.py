@@ -15,7 +15,7 @@ from tcgsplat.render.conventions import MAX_OPACITY, MIN_ALPHA
 from tcgsplat.render.numba_cpu.rasterizer import NumbaRasterizer
 from tcgsplat.render.protocol import Rasterizer, Splats
 from tcgsplat.render.reference import ReferenceRasterizer, project
-from tcgsplat.render.view import blended, render_view
+from tcgsplat.render.view import blend, render_view
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Submap
 
@@ -71,7 +71,7 @@ def test_it_is_the_sum_of_weights_written_out(rasterizer: Rasterizer, T_map_cam:
     images = torch.rand(CAMERA.height, CAMERA.width, 3, generator=torch.Generator().manual_seed(1))
     images = images * away_from_cuts(inputs | {"T_cam_map": T_cam_map})[..., None]
     expected = torch.einsum("hwn,hwc->nc", weights(submap, T_map_cam), images.double())
-    found = blended(submap, images, CAMERA, T_map_cam, rasterizer)
+    found = blend(submap, CAMERA, T_map_cam, rasterizer).shared_out(images)
     assert found.shape == (40, 3) and (expected > 1).any(dim=1).sum() > 10 and (expected == 0).any()
     torch.testing.assert_close(found.double(), expected, atol=2e-3, rtol=3e-4)
 
@@ -82,7 +82,8 @@ def test_both_rasterizers_agree(seed: int) -> None:
     submap, T_map_cam = submap_of(inputs), se3.inverse(inputs["T_cam_map"])
     images = torch.randn(CAMERA.height, CAMERA.width, 2, generator=torch.Generator().manual_seed(seed))
     images = images * away_from_cuts(inputs)[..., None]
-    a, b = (blended(submap, images, CAMERA, T_map_cam, each) for each in (NumbaRasterizer(), ReferenceRasterizer()))
+    rasterizers = NumbaRasterizer(), ReferenceRasterizer()
+    a, b = (blend(submap, CAMERA, T_map_cam, each).shared_out(images) for each in rasterizers)
     assert (a - b).norm() < 3e-4 * b.norm()
 
 
@@ -90,11 +91,22 @@ def test_a_picture_of_ones_hands_out_all_coverage(corner: Submap, rasterizer: Ra
     """What all Gaussians get together is what the picture holds: its opacity, and its confidence by their own."""
     T_map_cam = pose(0.03, 0.01, -0.02, degrees=(1, 4, -2))
     view = render_view(corner, ROOM_CAMERA, T_map_cam, rasterizer)
-    shares = blended(corner, torch.ones(60, 80, 1), ROOM_CAMERA, T_map_cam, rasterizer)[:, 0]
+    shares = blend(corner, ROOM_CAMERA, T_map_cam, rasterizer).shared_out(torch.ones(60, 80, 1))[:, 0]
     assert (shares >= 0).all() and not shares.requires_grad
     torch.testing.assert_close(shares.sum(), view.alpha.sum(), rtol=1e-4, atol=0)
     torch.testing.assert_close((shares * corner.confidence.value).sum(), view.confidence.sum(), rtol=1e-4, atol=0)
     assert not shares[~view.visible].any()
+
+
+def test_it_looks_as_it_does_otherwise_and_can_be_asked_again(corner: Submap, rasterizer: Rasterizer) -> None:
+    T_map_cam = pose(0.03, 0.01, -0.02, degrees=(1, 4, -2))
+    asked, images = blend(corner, ROOM_CAMERA, T_map_cam, rasterizer), torch.ones(60, 80, 1)
+    plain = render_view(corner, ROOM_CAMERA, T_map_cam, rasterizer)
+    for name in ("color", "composited_depth", "composited_plane_depth", "alpha", "confidence", "visible"):
+        assert torch.equal(getattr(asked.rendering, name), getattr(plain, name))
+        assert not getattr(asked.rendering, name).requires_grad
+    once, both = asked.shared_out(images), asked.shared_out(torch.cat((images, 2 * images), dim=-1))
+    assert torch.equal(both[:, :1], once) and torch.equal(both[:, 1:], 2 * once)
 
 
 def test_those_who_are_hidden_get_nearly_nothing(rasterizer: Rasterizer) -> None:
@@ -105,21 +117,21 @@ def test_those_who_are_hidden_get_nearly_nothing(rasterizer: Rasterizer) -> None
         "scales": torch.tensor([[0.3, 0.3, 0.001], [0.3, 0.3, 0.001], [0.05, 0.05, 0.001]]),
         "opacities": torch.full((3,), 0.99),
     }
-    shares = blended(submap_of(inputs), torch.ones(45, 61, 1), CAMERA, se3.identity(), rasterizer)[:, 0]
+    shares = blend(submap_of(inputs), CAMERA, se3.identity(), rasterizer).shared_out(torch.ones(45, 61, 1))[:, 0]
     assert shares[0] > 4 * shares[1] > 0
     assert shares[2] < 1e-2
 
 
 def test_nothing_is_handed_to_an_empty_map(rasterizer: Rasterizer) -> None:
     empty = Submap.anchored(se3.identity(), index=0)
-    assert blended(empty, torch.ones(45, 61, 2), CAMERA, se3.identity(), rasterizer).shape == (0, 2)
+    assert blend(empty, CAMERA, se3.identity(), rasterizer).shared_out(torch.ones(45, 61, 2)).shape == (0, 2)
 
 
 def test_room_and_camera_are_left_alone(room: Room, corner: Submap, rasterizer: Rasterizer) -> None:
     """No tensor of the map begins to ask for gradients, within `no_grad` and without."""
     images = room.frame().depth[..., None]
-    outside = blended(corner, images, ROOM_CAMERA, se3.identity(), rasterizer)
+    outside = blend(corner, ROOM_CAMERA, se3.identity(), rasterizer).shared_out(images)
     with torch.no_grad():
-        inside = blended(corner, images, ROOM_CAMERA, se3.identity(), rasterizer)
+        inside = blend(corner, ROOM_CAMERA, se3.identity(), rasterizer).shared_out(images)
     assert torch.equal(inside, outside)
     assert not any(t.requires_grad for t in (corner.gaussians.means, corner.gaussians.sh, images))
