@@ -90,6 +90,29 @@ def test_a_run_uses_every_kernel_with_the_types_that_it_declares_and_no_others(t
     assert [name for name, (as_declared, kept) in kernels.items() if not (as_declared and kept)] == []
 
 
+CALLS = """
+import re
+from tcgsplat.cli.ahead import MODULES
+from tcgsplat.render.numba_cpu.compilation import kernels_of
+
+for kernel in kernels_of(MODULES):
+    kernel.compile()
+    (code,) = kernel.dispatcher.inspect_llvm().values()
+    called = set(re.findall(r"call [^\\n]*@_ZN8tcgsplat([A-Za-z0-9_]*)", code))
+    print(kernel.name, len(code), sorted(name for name in called if f"{len(kernel.name)}{kernel.name}" not in name))
+"""
+
+
+def test_kernels_call_none_of_our_functions(tmp_path: Path):
+    """All are written into them; see `inner`."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", CALLS], env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    told = [line.split(maxsplit=2) for line in done.stdout.splitlines()]
+    assert len(told) > 10 and all(int(length) > 1000 for _, length, _ in told)
+    assert [name for name, _, calls in told if calls != "[]"] == []
+
+
 def test_kernels_need_no_torch():
     """Importing it takes longer than a helping process has to compile."""
     source = f"import sys; from tcgsplat.render.numba_cpu.compilation import kernels_of; kernels_of({MODULES!r})"

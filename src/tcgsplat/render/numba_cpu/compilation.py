@@ -34,9 +34,10 @@ _OPTIONS: Final[dict[str, Any]] = {
 _MOST_PROCESSES: Final = 4
 """With more, all but one would wait for the kernel that takes longest."""
 
-inner: Final = njit(**_OPTIONS | {"no_cpython_wrapper": True})
-"""Of functions that only kernels call and are kept with: without a way in from elsewhere and without machine code of
-their own they compile faster."""
+inner: Final = njit(**_OPTIONS | {"no_cpython_wrapper": True, "forceinline": True})
+"""Of functions that only kernels call, and are written into: without a way in from elsewhere they compile faster. Where
+one stayed a function, a kernel would call another copy of it when it has just been compiled than when it comes from
+disk, and the two may round differently."""
 
 
 def _digest() -> str:
