@@ -34,9 +34,9 @@ def test_no_thread_is_nicer_than_there_is() -> None:
     assert nicer(lambda: [step_back() for _ in range(5)] and niceness()) == 19
 
 
-def shared(workers: Workers) -> dict[int, int]:
-    """How nice each thread was that came to some work; the work lasts until all have come that were asked."""
-    seen, door = dict[int, int](), threading.Barrier(workers.threads)
+def shared(workers: Workers, come: int) -> dict[int, int]:
+    """How nice each thread was that came to some work; the work lasts until so many have come."""
+    seen, door = dict[int, int](), threading.Barrier(come)
 
     def work(worker: int) -> None:
         seen[worker] = niceness()
@@ -46,11 +46,11 @@ def shared(workers: Workers) -> dict[int, int]:
     return seen
 
 
-def test_helpers_are_as_nice_as_who_is_helped() -> None:
+def test_helpers_are_as_nice_as_who_is_helped_and_the_nicer_leave_a_core() -> None:
     workers, before = Workers(3), niceness()
     for _ in range(2):
-        assert shared(workers) == dict.fromkeys(range(3), before)
-        assert nicer(lambda: shared(workers)) == dict.fromkeys(range(3), before + 5)
+        assert shared(workers, 3) == dict.fromkeys(range(3), before)
+        assert nicer(lambda: shared(workers, 2)) == dict.fromkeys(range(2), before + 5)
 
 
 @pytest.mark.parametrize(("holder", "other", "alone"), [("nicer", "plain", False), ("plain", "nicer", True)])

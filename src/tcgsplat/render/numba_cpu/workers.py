@@ -25,12 +25,14 @@ class Workers:
         self.threads = threads
         self._door, self._busy = threading.Lock(), Counter[tuple[int, int]]()
         self._helpers: dict[int, ThreadPoolExecutor] = {}
+        self._niceness = priority.niceness()
 
     def together(self, work: Callable[[int], object], threads: int | None = None) -> None:
         """Call `work(0)` here and `work(1)`, `work(2)` ... on helpers; the first exception is raised.
 
         A helper may come late, when all is done, or never: `work` must share itself out as threads come. It is as nice
-        to the machine's other threads as the caller.
+        to the machine's other threads as the caller, and a nicer caller leaves a core to the others: where these take
+        one, all who share a phase would wait for the thread that was on it.
         """
         with self.reserved():
             pool, free = self._helping(priority.niceness())
@@ -66,7 +68,8 @@ class Workers:
         with self._door:
             if niceness not in self._helpers:  # its threads are as nice as the one that begins them
                 self._helpers[niceness] = ThreadPoolExecutor(max(self.threads - 1, 1), thread_name_prefix="splat")
-            return self._helpers[niceness], self.threads - sum(other <= niceness for other, _ in self._busy)
+            left = int(niceness > self._niceness)
+            return self._helpers[niceness], self.threads - left - sum(other <= niceness for other, _ in self._busy)
 
     def share(self, kernel: Callable[..., bool], arguments: Callable[[int], Arguments]) -> None:
         """Run a kernel of phases (see `phases.py`) on all threads, each with its own arguments, until all is done."""
