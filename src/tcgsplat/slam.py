@@ -184,7 +184,7 @@ class Slam:
 
         # The map that was optimised meanwhile comes into use, and the submaps stand where comparing the last one with
         # those before has shown them to be: after as many frames on a slow machine as on a fast one.
-        if self._growing is not None and self._growing.done():
+        if self._growing is not None and self._growing.done():  # a live system's: else it has been waited for
             self._take_growth()
         update = self._finished_update() if self._adopts_update else None
         closure = self._finished_closure() if self._adopts_closure else None

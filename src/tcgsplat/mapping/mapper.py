@@ -39,7 +39,7 @@ class Grown:
     before: Submap
     """As it was before it took in the frame."""
     view: Blend | None
-    """The frame's of that; None of a submap that is new."""
+    """The frame's view of that; None of a submap that is new."""
 
     @property
     def frame(self) -> Frame:

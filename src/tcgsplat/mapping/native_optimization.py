@@ -13,6 +13,7 @@ from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
 from tcgsplat.mapping import loss_kernels
 from tcgsplat.mapping import native_kernels as kernels
+from tcgsplat.mapping.optimization import Enough, never
 from tcgsplat.mapping.settings import MapperConfig
 from tcgsplat.render.losses import SSIM_C1, SSIM_C2, ssim_window
 from tcgsplat.render.numba_cpu.layout import (
@@ -96,7 +97,7 @@ class NativeOptimization:
         views: Sequence[int],
         frozen: tuple[str, ...] = (),
         paces: Sequence[float] | None = None,
-        enough: Callable[[], bool] = lambda: False,
+        enough: Enough = never,
     ) -> None:
         """See `Optimization`."""
         assert not frozen  # `covers` keeps such settings away
