@@ -120,8 +120,8 @@ class Slam:
             config: All settings.
             rasterizer: Backend of tracking and mapping.
             live: Never wait for the map: it grows beside tracking, is optimised until the next frame is due to be
-                mapped, and comes into use when it is ready. For a camera that does not wait either; what comes out
-                then depends on the machine's speed.
+                mapped or the submap to end, and comes into use when it is ready. For a camera that does not wait
+                either; what comes out then depends on the machine's speed.
             store: Where finished submaps go, and are read back from when their place is seen again; if left out,
                 memory.
             mapper: Makes the mapper, of the arguments of `Mapper`: for experiments with another one.
@@ -141,7 +141,7 @@ class Slam:
         self._mapping_thread = ThreadPoolExecutor(1, thread_name_prefix="mapping", initializer=behind)
         self._growing: Future[Grown] | None = None
         self._updating: Future[tuple[Submap, MapUpdate]] | None = None
-        self._since_mapped = 0
+        self._since_mapped, self._leaves = 0, False
         self._keeping_thread = ThreadPoolExecutor(1, thread_name_prefix="keeping", initializer=behind)
         self._keeping: deque[Future[Closure]] = deque()
         self._since_sealed = 0
@@ -208,8 +208,10 @@ class Slam:
         elsewhere = found.reference if found is not None and found.reference is not self.submap else None
 
         # Switch: seal the submap and anchor the next one at this camera (equation 16), which may be in an old submap.
+        may_end = tracked.converged and frame.has_depth
+        self._leaves = may_end and self._schedule.switches_submap(frame.index, T_map_cam, self.submap)
         may_map = tracked.converged and not (self._live and self._updates)
-        switches = may_map and self._schedule.switches_submap(frame.index, T_map_cam, self.submap) and frame.has_depth
+        switches = self._leaves and may_map
         if switches or elsewhere is not None:
             fresh = self._finished_update()
             closure = closure if self._live else self._finished_closure() or closure
@@ -229,7 +231,7 @@ class Slam:
             keyframe = Keyframe(self._synchronized(frame), T_map_cam, exposure.relaxed(EXPOSURE_LEAK))
             self._growing = self._mapping_thread.submit(self._grown, keyframe, self.submap, self.reference)
             self._updating = self._mapping_thread.submit(self._updated, self._growing)
-            self._since_mapped = 0
+            self._since_mapped, self._leaves = 0, False
             if not self._live or not len(self.reference.submap):
                 self._take_growth()
             clock.lap("grow")
@@ -388,16 +390,21 @@ class Slam:
     def _updated(self, growing: Future[Grown]) -> tuple[Submap, MapUpdate]:
         """Optimise (equations 20 to 24), then judge what moved (equations 4 to 15); runs beside tracking."""
         grown, started = growing.result(), time.perf_counter()
-        mapped = self._mapper.optimized(grown, self._maps_soon if self._live else never)
+        mapped = self._mapper.optimized(grown, self._makes_room if self._live else never)
         config = self.config
         submap = judged(mapped, grown.frame, config.confidence, config.mapper.depth_mode, self._rasterizer)
         seconds = time.perf_counter() - started
         frame_index = grown.submap.keyframes[-1].frame.index
         return submap, MapUpdate(frame_index, grown.seeded, mapped.pruned, mapped.loss, seconds)
 
-    def _maps_soon(self) -> bool:
-        """Whether a frame is due to be mapped, for which the update under way makes room."""
-        return self._schedule.due(self._since_mapped)
+    def _makes_room(self, steps: int) -> bool:
+        """Whether the update under way ends after so many steps.
+
+        At once if the submap is to end: the farther the camera goes on, the less of what it sees is in the map, and the
+        next submap hangs on the pose that is found there. For a frame that is due to be mapped, after half the steps.
+        """
+        half = 2 * steps >= self.config.mapper.iterations  # of a submap's first, too, which is waited for
+        return self._leaves or (half and self._schedule.due(self._since_mapped))
 
     def _take_growth(self) -> None:
         """Wait for the map that is growing, if any, and use it from now on, not yet optimised."""

@@ -229,11 +229,11 @@ class TestLive:
 
             def optimized(self, grown: Grown, enough: Enough = never) -> Mapped:
                 threads.add((threading.current_thread().name.split("_")[0], niceness()))
-                while not (enough() or over.is_set()):  # as if it took that long
+                while not (enough(CONFIG.mapper.iterations) or over.is_set()):  # as if it took that long
                     time.sleep(0.001)
                 return super().optimized(grown, enough)
 
-        slam = Slam(CONFIG, rasterizer, live=True, mapper=Seen)
+        slam = Slam(with_settings(CONFIG, {"schedule.submap_distance": 9.0}), rasterizer, live=True, mapper=Seen)
         used = dict[int, int]()
         for frame in filmed(SEQUENCE):
             report = slam.step(frame)
@@ -242,6 +242,28 @@ class TestLive:
         slam.finish()
         assert threads == {("mapping", niceness() + 5 if sys.platform == "linux" else 0)}
         assert len(used) >= 2 and all(later >= begun + CONFIG.schedule.map_every for begun, later in used.items())
+
+    def test_a_submap_ends_when_it_should_though_it_is_worked_on(self, rasterizer: Rasterizer) -> None:
+        """An update that would go on for ever gives way after its next step, and that step's map is what is sealed."""
+        over = threading.Event()
+
+        class Slow(Mapper):
+            def optimized(self, grown: Grown, enough: Enough = never) -> Mapped:
+                while not (enough(1) or over.is_set()):  # as if one step took that long
+                    time.sleep(0.001)
+                return super().optimized(grown, enough)
+
+        slam = Slam(CONFIG, rasterizer, live=True, mapper=Slow)
+        left, sealed = list[int](), list[StepReport]()
+        for frame in filmed(SEQUENCE):
+            report = slam.step(frame)
+            sealed += [report] if report.sealed else []
+            far = se3.translation_norm(slam.trajectory.rows[-1].T_map_cam) > CONFIG.schedule.submap_distance
+            left += [frame.index] if far and len(left) == len(sealed) else []
+        over.set()
+        slam.finish()
+        assert len(sealed) >= 2 and left[: len(sealed)] and all(report.update is not None for report in sealed)
+        assert all(0 < report.frame_index - frame <= 4 for frame, report in zip(left, sealed, strict=False))
 
 
 class TestSubmaps:

@@ -31,10 +31,15 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
     }
 )
 ENVIRONMENT: Mapping[str, str] = MappingProxyType(
-    {"NUMBA_THREADING_LAYER": "omp", "OMP_WAIT_POLICY": "passive", "OPENBLAS_NUM_THREADS": "1"}
+    {
+        "NUMBA_THREADING_LAYER": "omp",
+        "OMP_WAIT_POLICY": "passive",
+        "OPENBLAS_NUM_THREADS": "1",
+        "OPENCV_FOR_THREADS_NUM": "1",
+    }
 )
-"""Read by numba, torch's OpenMP and numpy's OpenBLAS when they are imported: without it their waiting threads keep
-cores busy. Numpy's matrices are small here."""
+"""Read by numba, torch's OpenMP, numpy's OpenBLAS and OpenCV when they are imported: without it their waiting threads
+keep cores busy, and who tracks waits for a helper that may be behind all others. Their arrays are small here."""
 
 YOUNG = 10_000
 """Objects that are made before Python looks for cycles among them. Imports make half a million that all stay: by

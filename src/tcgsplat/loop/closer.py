@@ -86,8 +86,8 @@ class LoopCloser:
             self.T_world_map = (*self.T_world_map, se3.orthonormalized(T_world_map))
         submap = self._load(index)
         self._relocalizer.remember(submap)
-        candidates = self._relocalizer.places.candidates(index, self.T_world_map, self._config)
-        registrations = tuple(self._registered(measured(submap), candidate) for candidate in candidates)
+        candidates, known = self._relocalizer.places.candidates(index, self.T_world_map, self._config), measured(submap)
+        registrations = tuple(self._registered(known, candidate) for candidate in candidates)
         loops = tuple(
             Edge(pair.source, pair.target, pair.T_target_source, pair.information, loop=True)
             for pair in registrations

@@ -55,6 +55,7 @@ class Localizer:
         self._config = config
         self._rasterizer = rasterizer
         self._tracker = Tracker(replace(tracker, solver="alignment"), confidence, rasterizer)
+        self._drawing: SubmapView | None = None
 
     def localized(self, frame: Frame, submap: Submap, guesses: Iterable[Pose]) -> Localized:
         """The pose of a picture in a submap, from the first guess that leads to one that is believed.
@@ -77,7 +78,9 @@ class Localizer:
         second = self._tracker.track(frame, submap, first.T_map_cam) if first.converged else first
         if not second.converged:
             return Localized(second, second.lost)
-        alpha = SubmapView(submap, self._rasterizer)(frame.camera, second.T_map_cam).alpha[frame.valid]
+        if self._drawing is None or self._drawing.submap is not submap:
+            self._drawing = SubmapView(submap, self._rasterizer)
+        alpha = self._drawing(frame.camera, second.T_map_cam).alpha[frame.valid]
         coverage = float((alpha > MIN_COVERAGE).to(torch.float32).mean())
         return Localized(second, self._objection(first, second, coverage), coverage)
 

@@ -116,7 +116,7 @@ class Mapper:
 
         Args:
             grown: Not yet optimised.
-            enough: Whether the steps that are left are to be left out; asked from halfway on.
+            enough: Whether the steps that are left are to be left out, asked after each of how many were made.
         """
         iterations = self._config.first_iterations if grown.first else self._config.iterations
         judged = experienced(grown, self._confidence, self.disagreement)
@@ -164,8 +164,8 @@ class Mapper:
             if start == half > 0:
                 optimization.prune()
             frozen = ("sh",) if start < colored else ()
-            optimization.steps(views[start:stop], frozen, enough=enough if start >= half else never)
-            if stop > half and enough():
+            optimization.steps(views[start:stop], frozen, enough=_after(start, enough))
+            if enough(stop):
                 break
         optimization.prune()
         return optimization
@@ -175,6 +175,11 @@ class Mapper:
         if count == 1 or float(torch.rand((), generator=self._generator)) < self._config.current_share:
             return count - 1
         return int(torch.randint(count - 1, (), generator=self._generator))
+
+
+def _after(before: int, enough: Enough) -> Enough:
+    """The same question of who counts from 1 after some steps."""
+    return lambda made: enough(before + made)
 
 
 def birth_error(frame: Frame, rendering: Rendering | None, config: ConfidenceConfig) -> Plane:

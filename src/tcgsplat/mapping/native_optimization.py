@@ -101,9 +101,9 @@ class NativeOptimization:
     ) -> None:
         """See `Optimization`."""
         assert not frozen  # `covers` keeps such settings away
-        for view, pace in zip(views, paces or [1.0] * len(views), strict=True):
+        for made, (view, pace) in enumerate(zip(views, paces or [1.0] * len(views), strict=True), start=1):
             self._step(self._view(view), pace)
-            if enough():
+            if enough(made):
                 break
 
     def _step(self, target: _View, pace: float) -> None:

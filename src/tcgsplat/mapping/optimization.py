@@ -24,11 +24,11 @@ from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import PerGaussian, PerGaussianFlag, Pose
 
-Enough = Callable[[], bool]
-"""Whether an optimisation is to end here, though it could go on."""
+Enough = Callable[[int], bool]
+"""Whether an optimisation is to end after so many steps, though it could go on."""
 
 
-def never() -> bool:
+def never(_made: int) -> bool:
     """Each step is made."""
     return False
 
@@ -47,7 +47,8 @@ class Optimization(Protocol):
         """At one keyframe after the other follow the gradient of Eq. 21 by one Adam step of every Gaussian in view.
 
         Parameters named in `frozen` stay; `paces` are factors on the learning rates, one for each step. After each
-        step `enough` is asked, if true no other is made; where they are launched as a whole, all are.
+        step `enough` is told how many these were, and if it says so no other is made; where they are launched as a
+        whole, all are.
         """
         ...
 
