@@ -47,6 +47,9 @@ from tcgsplat.tracking.tracker import Tracked, Tracker
 EXPOSURE_LEAK = 0.01
 """How much nearer to none a keyframe's exposure is taken than it was found. Each is found beside a map that was made
 with those before it; an error of theirs that is always the same adds up to a hundred times itself, not more."""
+KNOWN = 0.5
+"""Share of what a live camera measures that is in the map, below which the map is grown as soon as may be: where half
+is new, the rest is soon out of the picture."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,7 @@ class Slam:
         self._mapping_thread = ThreadPoolExecutor(1, thread_name_prefix="mapping", initializer=behind)
         self._growing: Future[Grown] | None = None
         self._updating: Future[tuple[Submap, MapUpdate]] | None = None
-        self._since_mapped, self._leaves = 0, False
+        self._since_mapped, self._presses = 0, False
         self._keeping_thread = ThreadPoolExecutor(1, thread_name_prefix="keeping", initializer=behind)
         self._keeping: deque[Future[Closure]] = deque()
         self._since_sealed = 0
@@ -209,9 +212,10 @@ class Slam:
 
         # Switch: seal the submap and anchor the next one at this camera (equation 16), which may be in an old submap.
         may_end = tracked.converged and frame.has_depth
-        self._leaves = may_end and self._schedule.switches_submap(frame.index, T_map_cam, self.submap)
+        leaves = may_end and self._schedule.switches_submap(frame.index, T_map_cam, self.submap)
         may_map = tracked.converged and not (self._live and self._updates)
-        switches = self._leaves and may_map
+        switches = leaves and may_map
+        self._presses = leaves or (self._live and tracked.coverage < KNOWN * frame.measured)
         if switches or elsewhere is not None:
             fresh = self._finished_update()
             closure = closure if self._live else self._finished_closure() or closure
@@ -231,7 +235,7 @@ class Slam:
             keyframe = Keyframe(self._synchronized(frame), T_map_cam, exposure.relaxed(EXPOSURE_LEAK))
             self._growing = self._mapping_thread.submit(self._grown, keyframe, self.submap, self.reference)
             self._updating = self._mapping_thread.submit(self._updated, self._growing)
-            self._since_mapped, self._leaves = 0, False
+            self._since_mapped, self._presses = 0, False
             if not self._live or not len(self.reference.submap):
                 self._take_growth()
             clock.lap("grow")
@@ -400,11 +404,12 @@ class Slam:
     def _makes_room(self, steps: int) -> bool:
         """Whether the update under way ends after so many steps.
 
-        At once if the submap is to end: the farther the camera goes on, the less of what it sees is in the map, and the
-        next submap hangs on the pose that is found there. For a frame that is due to be mapped, after half the steps.
+        At once if little of what is seen is in the map, or if the submap is to end: the farther the camera goes on, the
+        less will be, and the next submap hangs on the pose that is found there. For a frame that is due to be mapped,
+        after half the steps.
         """
         half = 2 * steps >= self.config.mapper.iterations  # of a submap's first, too, which is waited for
-        return self._leaves or (half and self._schedule.due(self._since_mapped))
+        return self._presses or (half and self._schedule.due(self._since_mapped))
 
     def _take_growth(self) -> None:
         """Wait for the map that is growing, if any, and use it from now on, not yet optimised."""

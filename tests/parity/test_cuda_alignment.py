@@ -97,7 +97,7 @@ def test_a_frame_is_aligned_as_on_the_cpu(
     assert se3.translation_norm(apart) < 1e-3 * moved
     assert se3.rotation_angle(apart) < 1e-4
     assert found.iterations == expected.iterations
-    for name in ("overlap", "agreement", "correlation"):
+    for name in ("coverage", "overlap", "agreement", "correlation"):
         assert getattr(found, name) == pytest.approx(getattr(expected, name), abs=2e-3), name
     assert found.exposure.gain == pytest.approx(expected.exposure.gain, abs=1e-3)
     assert found.exposure.offset == pytest.approx(expected.exposure.offset, abs=1e-3)

@@ -26,7 +26,7 @@ from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.render.view import Rendering, render_view
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Keyframe, Submap
-from tcgsplat.slam import Slam, StepReport
+from tcgsplat.slam import KNOWN, Slam, StepReport
 from tcgsplat.tensors import Pose
 from tcgsplat.tracking.alignment import AlignmentConfig
 from tcgsplat.tracking.tracker import Tracker, TrackerConfig
@@ -264,6 +264,27 @@ class TestLive:
         slam.finish()
         assert len(sealed) >= 2 and left[: len(sealed)] and all(report.update is not None for report in sealed)
         assert all(0 < report.frame_index - frame <= 4 for frame, report in zip(left, sealed, strict=False))
+
+    def test_what_is_seen_for_the_first_time_does_not_wait_for_what_is_known(self, rasterizer: Rasterizer) -> None:
+        """A camera that turns away from its map has more of it before the last of it is out of the picture."""
+        over = threading.Event()
+
+        class Slow(Mapper):
+            def optimized(self, grown: Grown, enough: Enough = never) -> Mapped:
+                while not (enough(1) or over.is_set()):  # as if one step took that long
+                    time.sleep(0.001)
+                return super().optimized(grown, enough)
+
+        one = with_settings(CONFIG, {"schedule.submap_distance": 9.0, "schedule.submap_angle": 180.0})
+        slam = Slam(one, rasterizer, live=True, mapper=Slow)
+        turning = RoomSequence(tuple(pose(degrees=(0.0, 1.5 * i, 0.0)) for i in range(50)))
+        reports = [slam.step(frame) for frame in filmed(turning)]
+        over.set()
+        slam.finish()
+        updated = [report.frame_index for report in reports if report.update is not None]
+        assert len(updated) >= 2 and not any(report.tracked.lost for report in reports)
+        assert all(min(r.tracked.coverage for r in reports[i - 4 : i]) < KNOWN for i in updated)
+        assert min(report.tracked.coverage for report in reports) > 0.2
 
 
 class TestSubmaps:

@@ -376,6 +376,7 @@ def test_what_the_map_does_not_cover_gives_no_points(room: Room) -> None:
     half = at_once(room.frame(T_NEAR), holed)
     assert errors(full.T_map_cam, T_NEAR)[0] < 1
     assert errors(half.T_map_cam, T_NEAR)[0] < 2.5
+    assert (full.coverage, half.coverage) == (1, pytest.approx(48 / 80))
 
 
 def test_thin_coverage_gives_no_points(room: Room) -> None:

@@ -83,6 +83,7 @@ def test_a_frame_is_tracked_against_the_map(
     R = tracked.T_map_cam[:3, :3]
     torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64), atol=1e-12, rtol=0)
     assert tracked.overlap > 0.9 and tracked.agreement > 0.9 and tracked.correlation > 0.9
+    assert 0.9 < tracked.coverage <= 1
 
 
 class Counting:

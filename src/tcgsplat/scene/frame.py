@@ -40,6 +40,11 @@ class Frame:
         """Whether a surface was measured anywhere: a map can begin."""
         return bool((self.valid & (self.depth > 0)).any())
 
+    @property
+    def measured(self) -> float:
+        """Share of the picture where a surface was measured."""
+        return float((self.valid & (self.depth > 0)).to(torch.float32).mean())
+
     def with_depth_later(self, seconds: float) -> "Frame":
         """The same frame whose depth image was taken so much later than it says."""
         return replace(self, depth_timestamp=self.timestamp + self.depth_delay + seconds)

@@ -102,6 +102,8 @@ class Alignment:
 
     T_map_cam: Pose
     iterations: int
+    coverage: float
+    """Share of the rendered view that the map covers."""
     overlap: float
     """Share of the rendered view that falls into the live image."""
     agreement: float
@@ -155,6 +157,8 @@ class ReferenceView:
     T_map_ref: Pose
     """Where it was rendered."""
     camera: Camera
+    coverage: float
+    """Share of it that gives points."""
     levels: tuple[Level, ...]
     """Finest first; those that have no passes, too, without points."""
     solid_points: Floats
@@ -185,6 +189,7 @@ def reference_view(
     """
     composited = luma(rendering.color)
     intensity, depth = rendered_view(rendering, composited, config.min_alpha)
+    coverage = float(np.count_nonzero(depth >= 0)) / depth.size
     solid = np.where(rendering.alpha.numpy() > SOLID, depth, NOTHING)
     weights, scaled = np.ascontiguousarray(weight.numpy()), camera
     levels, nothing = list[Level](), np.empty((kernels.POINT, 0), np.float32)
@@ -202,7 +207,7 @@ def reference_view(
         if passes and not begun:
             solid_points = reference_points(composited, solid, weights, intrinsics, *sampling)
         levels.append(Level(passes, points, intrinsics, 2 * config.gate if number else config.gate))
-    return ReferenceView(T_map_ref, camera, tuple(levels), solid_points)
+    return ReferenceView(T_map_ref, camera, coverage, tuple(levels), solid_points)
 
 
 @dataclass(frozen=True)
@@ -333,6 +338,7 @@ def align(frame: Frame, view: ReferenceView, guess: Pose, config: AlignmentConfi
         T,
         passes,
         photometry,
+        coverage=view.coverage,
         points=int(np.count_nonzero(finest.level.points[kernels.PZ])),
         last=sums,
         color=_sums(finest, T, photometry, replace(config, depth_weight=0.0)),
@@ -347,6 +353,7 @@ def concluded(
     passes: int,
     photometry: Photometry,
     *,
+    coverage: float,
     points: int,
     last: Doubles,
     color: Doubles,
@@ -360,6 +367,7 @@ def concluded(
         T_live_ref: What was found: reference camera to live camera.
         passes: How many it took.
         photometry: As it was found.
+        coverage: Of the rendered view.
         points: Of the finest level.
         last: Sums of the last pass that moved the pose.
         color: Of the finest level at the pose that was found, without depth's residuals.
@@ -371,6 +379,7 @@ def concluded(
     return Alignment(
         T_map_cam=T_map_ref @ se3.inverse(torch.from_numpy(T_live_ref)),
         iterations=passes,
+        coverage=coverage,
         overlap=float(last[kernels.IN_VIEW]) / max(points, 1),
         agreement=float(last[kernels.AGREEING]) / readings if readings else 1.0,
         correlation=correlation(

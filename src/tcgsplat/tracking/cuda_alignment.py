@@ -62,6 +62,7 @@ class CudaReferenceView:
     T_map_ref: Pose
     """On the CPU."""
     camera: Camera
+    coverage: Tensor
     levels: tuple[Level, ...]
     solid_points: Tensor
 
@@ -172,6 +173,7 @@ def reference_view(
     """
     images, weights, scaled, levels = _Images(kernels), weight.contiguous(), camera, list[Level]()
     intensity, depth, composited, solid = images.rendered(rendering, config.min_alpha)
+    coverage = (depth >= 0).double().mean()
     nothing = depth.new_empty(cpu_kernels.POINT, 0)
     solid_points = nothing
     for number, passes in enumerate(passes_of_levels(config, camera)):
@@ -187,7 +189,7 @@ def reference_view(
         if passes and not begun:
             solid_points = images.points(composited, solid, weights, scaled, *sampling)
         levels.append(Level(passes, points, scaled, 2 * config.gate if number else config.gate))
-    return CudaReferenceView(T_map_ref, camera, tuple(levels), solid_points)
+    return CudaReferenceView(T_map_ref, camera, coverage, tuple(levels), solid_points)
 
 
 def _pairs(images: _Images, frame: Frame, view: CudaReferenceView) -> list[_Pair]:
@@ -225,15 +227,16 @@ def align(kernels: Kernels, frame: Frame, view: CudaReferenceView, guess: Pose, 
     both = images.passed(finest, state, config, balance=1.0, **at_rest)
     on_solid = replace(finest, level=replace(finest.level, points=view.solid_points))
     solid = images.passed(on_solid, state, config, balance=config.depth_weight, **at_rest)
-    count = (finest.level.points[cpu_kernels.PZ] != 0).sum().double()[None]
-    told = torch.cat((state, last, color, both, solid, count)).cpu().numpy()
-    state_found, *sums, points = np.split(told, np.cumsum([_STATE, *[cpu_kernels.SUMS] * 4]))
+    points = (finest.level.points[cpu_kernels.PZ] != 0).sum().double()
+    told = torch.cat((state, last, color, both, solid, torch.stack((points, view.coverage)))).cpu().numpy()
+    state_found, *sums, shown = np.split(told, np.cumsum([_STATE, *[cpu_kernels.SUMS] * 4]))
     return concluded(
         view.T_map_ref,
         state_found[_POSE:_GAIN].reshape(4, 4),
         int(state_found[_PASSES]),
         Photometry(*state_found[_GAIN:_DONE].tolist()),
-        points=int(points[0]),
+        coverage=float(shown[1]),
+        points=int(shown[0]),
         last=sums[0],
         color=sums[1],
         both=sums[2],

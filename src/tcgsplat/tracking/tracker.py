@@ -93,6 +93,8 @@ class Tracked:
     """Why the solver's pose is not believed; empty if it is."""
     iterations: int = 0
     """Passes or steps of the solver."""
+    coverage: float = 1.0
+    """Share of the view that the map covers."""
     overlap: float = 1.0
     """Share of the mapped view that is in the picture."""
     agreement: float = 1.0
@@ -112,8 +114,10 @@ class Tracked:
         return not self.lost
 
 
-def _compared(rendering: Rendering, frame: Frame, gate: float) -> tuple[float, float, float]:
-    """Share of the covered pixels that have a reading, share of those whose depth agrees, correlation of colours."""
+def _compared(rendering: Rendering, frame: Frame, gate: float) -> tuple[float, float, float, float]:
+    """Share of covered pixels, of those the share that have a reading, of these the share whose depth agrees, and the
+    correlation of colours.
+    """
     rendering, frame = rendering.cpu(), frame.cpu()
     depth = rendering.depth
     both = (depth > 0) & (frame.depth > 0) & frame.valid
@@ -122,6 +126,7 @@ def _compared(rendering: Rendering, frame: Frame, gate: float) -> tuple[float, f
     pixels = ((depth > 0) & frame.valid).numpy()
     x, y = luma(rendering.color)[pixels].astype(np.float64), luma(frame.color)[pixels].astype(np.float64)
     return (
+        covered / depth.numel(),
         float(both.sum()) / max(covered, 1.0),
         float(agreeing.sum()) / max(float(both.sum()), 1.0),
         correlation(len(x), x.sum(), y.sum(), x @ x, x @ y, y @ y),
@@ -178,6 +183,7 @@ class Tracker:
         tracked = Tracked(
             found.T_map_cam,
             iterations=found.iterations,
+            coverage=found.coverage,
             overlap=found.overlap,
             agreement=found.agreement,
             correlation=found.correlation,
