@@ -52,7 +52,7 @@ class TestFound:
         millimetres, degrees = errors(found.tracked.T_map_cam, T_TRUE)
         assert millimetres < 2
         assert degrees < 0.1
-        assert 0.9 < found.coverage < 1
+        assert 0.9 < found.tracked.coverage < 1
 
     def test_without_depth(self, frame: Frame, corner: Submap, rasterizer: Rasterizer) -> None:
         blind = replace(frame, depth=torch.zeros_like(frame.depth))
@@ -91,7 +91,6 @@ class TestGuesses:
         found = localizer(rasterizer).localized(frame, corner, [])
         assert found.failed == "no guess"
         assert found.tracked.lost
-        assert found.coverage == 0
         assert np.array_equal(found.information, np.zeros((6, 6)))
 
     def test_the_second_is_used_where_the_first_fails(
@@ -123,12 +122,12 @@ class TestGates:
         aside = T_TRUE @ pose(degrees=(0, 20, 0))
         frame = Room().frame(aside, 7)
         found = localizer(rasterizer).localized(frame, corner, [aside])
-        assert 0.3 < found.coverage < 0.9
+        assert 0.3 < found.tracked.coverage < 0.9
         assert not found.failed
-        for limit, passes in ((found.coverage - 0.01, True), (found.coverage + 0.01, False)):
+        for limit, passes in ((found.tracked.coverage - 0.01, True), (found.tracked.coverage + 0.01, False)):
             again = localizer(rasterizer, loop=LoopConfig(min_coverage=limit)).localized(frame, corner, [aside])
             assert (not again.failed) is passes
-        assert again.failed == f"the map covers only {100 * found.coverage:.0f} % of it"
+        assert again.failed == f"the map covers only {100 * found.tracked.coverage:.0f} % of it"
 
     def test_coverage_is_of_what_the_camera_saw(self, frame: Frame, corner: Submap, rasterizer: Rasterizer) -> None:
         aside = T_TRUE @ pose(degrees=(0, 20, 0))
@@ -137,8 +136,8 @@ class TestGates:
         whole, right = (localizer(rasterizer).localized(f, corner, [aside]) for f in (frame, half))
         other = replace(frame, valid=~half.valid)
         left = localizer(rasterizer).localized(other, corner, [aside])
-        assert max(left.coverage, right.coverage) > whole.coverage + 0.1
-        assert min(left.coverage, right.coverage) < whole.coverage - 0.1
+        assert max(left.tracked.coverage, right.tracked.coverage) > whole.tracked.coverage + 0.1
+        assert min(left.tracked.coverage, right.tracked.coverage) < whole.tracked.coverage - 0.1
 
     def test_agreement(self, frame: Frame, corner: Submap, rasterizer: Rasterizer) -> None:
         """Something that is not in the map stands before a part of the picture."""
@@ -175,7 +174,7 @@ class TestGates:
         ],
     )
     def test_settled_in_place_and_in_direction(self, moved: Pose, settled: bool, rasterizer: Rasterizer) -> None:
-        objection = localizer(rasterizer)._objection(Tracked(T_TRUE), Tracked(T_TRUE @ moved), 1.0)
+        objection = localizer(rasterizer)._objection(Tracked(T_TRUE), Tracked(T_TRUE @ moved))
         assert (not objection) is settled
 
     def test_what_the_tracker_refuses(self, frame: Frame, corner: Submap, rasterizer: Rasterizer) -> None:

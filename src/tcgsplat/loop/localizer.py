@@ -5,14 +5,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from jaxtyping import Float64
 
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
 from tcgsplat.loop.settings import LoopConfig
 from tcgsplat.render.protocol import Rasterizer
-from tcgsplat.render.view import MIN_COVERAGE, SubmapView
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
@@ -33,8 +31,6 @@ class Localized:
     tracked: Tracked
     failed: str
     """Why not; empty if it is believed."""
-    coverage: float = 0.0
-    """Share of the picture that the map covers."""
 
     @property
     def information(self) -> Float64[np.ndarray, "6 6"]:
@@ -53,9 +49,7 @@ class Localizer:
         self, config: LoopConfig, tracker: TrackerConfig, confidence: ConfidenceConfig, rasterizer: Rasterizer
     ) -> None:
         self._config = config
-        self._rasterizer = rasterizer
         self._tracker = Tracker(replace(tracker, solver="alignment"), confidence, rasterizer)
-        self._drawing: SubmapView | None = None
 
     def localized(self, frame: Frame, submap: Submap, guesses: Iterable[Pose]) -> Localized:
         """The pose of a picture in a submap, from the first guess that leads to one that is believed.
@@ -78,21 +72,17 @@ class Localizer:
         second = self._tracker.track(frame, submap, first.T_map_cam) if first.converged else first
         if not second.converged:
             return Localized(second, second.lost)
-        if self._drawing is None or self._drawing.submap is not submap:
-            self._drawing = SubmapView(submap, self._rasterizer)
-        alpha = self._drawing(frame.camera, second.T_map_cam).alpha[frame.valid]
-        coverage = float((alpha > MIN_COVERAGE).to(torch.float32).mean())
-        return Localized(second, self._objection(first, second, coverage), coverage)
+        return Localized(second, self._objection(first, second))
 
-    def _objection(self, first: Tracked, second: Tracked, coverage: float) -> str:
+    def _objection(self, first: Tracked, second: Tracked) -> str:
         """What speaks against a pose; empty if nothing does."""
         config = self._config
         moved = se3.inverse(first.T_map_cam) @ second.T_map_cam
         step, turn = se3.translation_norm(moved), se3.rotation_angle(moved)
         if step > _SETTLED_METERS or turn > _SETTLED_RADIANS:
             return f"its pose is not settled: it moved on by {1e3 * step:.0f} mm and {math.degrees(turn):.1f} degrees"
-        if not coverage >= config.min_coverage:  # NaN, too
-            return f"the map covers only {100 * coverage:.0f} % of it"
+        if second.coverage < config.min_coverage:
+            return f"the map covers only {100 * second.coverage:.0f} % of it"
         if second.agreement < config.min_agreement:
             return f"only {100 * second.agreement:.0f} % of its depth agrees with the map"
         if second.correlation < config.min_correlation:

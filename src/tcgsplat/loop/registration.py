@@ -123,7 +123,7 @@ def _estimate(
         "",
         found.tracked.T_map_cam @ se3.inverse(keyframe.T_map_cam),
         carried.T @ found.information @ carried,
-        found.coverage,
+        found.tracked.coverage,
     )
 
 

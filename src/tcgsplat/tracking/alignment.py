@@ -103,7 +103,7 @@ class Alignment:
     T_map_cam: Pose
     iterations: int
     coverage: float
-    """Share of the rendered view that the map covers."""
+    """Share of the frame's valid pixels where the rendered view has something."""
     overlap: float
     """Share of the rendered view that falls into the live image."""
     agreement: float
@@ -157,8 +157,8 @@ class ReferenceView:
     T_map_ref: Pose
     """Where it was rendered."""
     camera: Camera
-    coverage: float
-    """Share of it that gives points."""
+    covered: npt.NDArray[np.bool_]
+    """Where it gives points, [h, w]."""
     levels: tuple[Level, ...]
     """Finest first; those that have no passes, too, without points."""
     solid_points: Floats
@@ -189,7 +189,7 @@ def reference_view(
     """
     composited = luma(rendering.color)
     intensity, depth = rendered_view(rendering, composited, config.min_alpha)
-    coverage = float(np.count_nonzero(depth >= 0)) / depth.size
+    covered = depth >= 0
     solid = np.where(rendering.alpha.numpy() > SOLID, depth, NOTHING)
     weights, scaled = np.ascontiguousarray(weight.numpy()), camera
     levels, nothing = list[Level](), np.empty((kernels.POINT, 0), np.float32)
@@ -207,7 +207,7 @@ def reference_view(
         if passes and not begun:
             solid_points = reference_points(composited, solid, weights, intrinsics, *sampling)
         levels.append(Level(passes, points, intrinsics, 2 * config.gate if number else config.gate))
-    return ReferenceView(T_map_ref, camera, coverage, tuple(levels), solid_points)
+    return ReferenceView(T_map_ref, camera, covered, tuple(levels), solid_points)
 
 
 @dataclass(frozen=True)
@@ -332,13 +332,14 @@ def align(frame: Frame, view: ReferenceView, guess: Pose, config: AlignmentConfi
             passes += 1
             if np.linalg.norm(step[:3]) < SMALL and np.linalg.norm(step[3:]) < SMALL and pair is not finest:
                 break
+    valid = frame.valid.numpy()
     solid = replace(finest, level=replace(finest.level, points=view.solid_points))
     return concluded(
         view.T_map_ref,
         T,
         passes,
         photometry,
-        coverage=view.coverage,
+        coverage=int(np.count_nonzero(view.covered & valid)) / max(int(np.count_nonzero(valid)), 1),
         points=int(np.count_nonzero(finest.level.points[kernels.PZ])),
         last=sums,
         color=_sums(finest, T, photometry, replace(config, depth_weight=0.0)),
@@ -367,7 +368,7 @@ def concluded(
         T_live_ref: What was found: reference camera to live camera.
         passes: How many it took.
         photometry: As it was found.
-        coverage: Of the rendered view.
+        coverage: Of the frame by the rendered view.
         points: Of the finest level.
         last: Sums of the last pass that moved the pose.
         color: Of the finest level at the pose that was found, without depth's residuals.

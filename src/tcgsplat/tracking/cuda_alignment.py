@@ -62,7 +62,7 @@ class CudaReferenceView:
     T_map_ref: Pose
     """On the CPU."""
     camera: Camera
-    coverage: Tensor
+    covered: Tensor
     levels: tuple[Level, ...]
     solid_points: Tensor
 
@@ -173,7 +173,7 @@ def reference_view(
     """
     images, weights, scaled, levels = _Images(kernels), weight.contiguous(), camera, list[Level]()
     intensity, depth, composited, solid = images.rendered(rendering, config.min_alpha)
-    coverage = (depth >= 0).double().mean()
+    covered = depth >= 0
     nothing = depth.new_empty(cpu_kernels.POINT, 0)
     solid_points = nothing
     for number, passes in enumerate(passes_of_levels(config, camera)):
@@ -189,7 +189,7 @@ def reference_view(
         if passes and not begun:
             solid_points = images.points(composited, solid, weights, scaled, *sampling)
         levels.append(Level(passes, points, scaled, 2 * config.gate if number else config.gate))
-    return CudaReferenceView(T_map_ref, camera, coverage, tuple(levels), solid_points)
+    return CudaReferenceView(T_map_ref, camera, covered, tuple(levels), solid_points)
 
 
 def _pairs(images: _Images, frame: Frame, view: CudaReferenceView) -> list[_Pair]:
@@ -228,7 +228,8 @@ def align(kernels: Kernels, frame: Frame, view: CudaReferenceView, guess: Pose, 
     on_solid = replace(finest, level=replace(finest.level, points=view.solid_points))
     solid = images.passed(on_solid, state, config, balance=config.depth_weight, **at_rest)
     points = (finest.level.points[cpu_kernels.PZ] != 0).sum().double()
-    told = torch.cat((state, last, color, both, solid, torch.stack((points, view.coverage)))).cpu().numpy()
+    coverage = (view.covered & frame.valid).sum() / frame.valid.sum().clamp_min(1)
+    told = torch.cat((state, last, color, both, solid, torch.stack((points, coverage)))).cpu().numpy()
     state_found, *sums, shown = np.split(told, np.cumsum([_STATE, *[cpu_kernels.SUMS] * 4]))
     return concluded(
         view.T_map_ref,

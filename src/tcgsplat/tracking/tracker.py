@@ -94,7 +94,7 @@ class Tracked:
     iterations: int = 0
     """Passes or steps of the solver."""
     coverage: float = 1.0
-    """Share of the view that the map covers."""
+    """Share of the frame's valid pixels that the map covers, as seen from where it was rendered."""
     overlap: float = 1.0
     """Share of the mapped view that is in the picture."""
     agreement: float = 1.0
@@ -115,8 +115,8 @@ class Tracked:
 
 
 def _compared(rendering: Rendering, frame: Frame, gate: float) -> tuple[float, float, float, float]:
-    """Share of covered pixels, of those the share that have a reading, of these the share whose depth agrees, and the
-    correlation of colours.
+    """Share of valid pixels that are covered, of those the share that have a reading, of these the share whose depth
+    agrees, and the correlation of colours.
     """
     rendering, frame = rendering.cpu(), frame.cpu()
     depth = rendering.depth
@@ -126,7 +126,7 @@ def _compared(rendering: Rendering, frame: Frame, gate: float) -> tuple[float, f
     pixels = ((depth > 0) & frame.valid).numpy()
     x, y = luma(rendering.color)[pixels].astype(np.float64), luma(frame.color)[pixels].astype(np.float64)
     return (
-        covered / depth.numel(),
+        len(x) / max(float(frame.valid.sum()), 1.0),
         float(both.sum()) / max(covered, 1.0),
         float(agreeing.sum()) / max(float(both.sum()), 1.0),
         correlation(len(x), x.sum(), y.sum(), x @ x, x @ y, y @ y),
@@ -149,7 +149,8 @@ class Tracker:
         In an empty submap the guess is the pose, unless there is no depth to begin a map with.
         """
         if len(submap) == 0:
-            return Tracked(guess, "" if frame.has_depth else "there is no map yet, and no depth to begin one with")
+            lost = "" if frame.has_depth else "there is no map yet, and no depth to begin one with"
+            return Tracked(guess, lost, coverage=0.0)
         if self._config.solver == "descent":
             found = descend(frame, submap, guess, self._rasterizer, self._config.descent, floor=self._floor)
             rendering = render_view(submap, frame.camera, found.T_map_cam, self._rasterizer)
