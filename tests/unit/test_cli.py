@@ -64,6 +64,18 @@ def test_a_run_begins_without_what_only_closing_a_loop_needs():
     assert done.returncode == 0, done.stderr
 
 
+def test_kernels_are_looked_for_without_linear_algebra_that_can_be_had_all_the_same():
+    """Importing it takes a tenth of a second, and only products of matrices need it."""
+    done = python(
+        "import sys; from tcgsplat.cli.ahead import compiled_meanwhile\n"
+        "with compiled_meanwhile():\n"
+        "    early = 'scipy.linalg' in sys.modules\n"
+        "import scipy.linalg.cython_blas\n"
+        "sys.exit(early)"
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_help_lists_every_command_and_every_command_is_there(capsys: pytest.CaptureFixture[str]):
     assert main(["--help"]) == 0
     text = capsys.readouterr().out

@@ -1,5 +1,6 @@
 """Compiling kernels while torch is imported: this module imports none of it."""
 
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,10 +37,24 @@ def compiled_meanwhile() -> Iterator[Waited]:
 
     Gives how long it took beyond that, once it is over.
     """
-    waited, kernels = Waited(), [kernel for kernel in kernels_of(MODULES) if not kernel.kept]
+    with _as_if_missing("scipy.linalg.cython_blas"):  # which numba takes 0.1 s to import, for products of matrices
+        waited, kernels = Waited(), [kernel for kernel in kernels_of(MODULES) if not kernel.kept]
     if kernels:
         say(ANNOUNCEMENT)
     with compiled(kernels, available_cores()):
         yield waited
         inside = time.perf_counter()
     waited.seconds = time.perf_counter() - inside
+
+
+@contextmanager
+def _as_if_missing(module: str) -> Iterator[None]:
+    """Whoever imports it inside finds that it is not installed, unless it is there already."""
+    absent = module not in sys.modules
+    if absent:
+        sys.modules[module] = None  # type: ignore[assignment]  # what Python itself puts there to say so
+    try:
+        yield
+    finally:
+        if absent:
+            del sys.modules[module]
