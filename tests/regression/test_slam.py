@@ -5,6 +5,8 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -205,6 +207,19 @@ def filmed(frames: Iterable[Frame]) -> Iterator[Frame]:
         time.sleep(0.05)
 
 
+class Endless(Mapper):
+    """One whose updates would take for ever, did they not give way after a step, or once all is over."""
+
+    def __init__(self, over: threading.Event, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._over = over
+
+    def optimized(self, grown: Grown, enough: Enough = never) -> Mapped:
+        while not (enough(1) or self._over.is_set()):
+            time.sleep(0.001)
+        return super().optimized(grown, enough)
+
+
 class TestLive:
     def test_a_live_system_maps_when_it_can(self, rasterizer: Rasterizer) -> None:
         """Whatever its speed, one update is worked on at a time, none is lost, and the camera is where it was."""
@@ -246,14 +261,7 @@ class TestLive:
     def test_a_submap_ends_when_it_should_though_it_is_worked_on(self, rasterizer: Rasterizer) -> None:
         """An update that would go on for ever gives way after its next step, and that step's map is what is sealed."""
         over = threading.Event()
-
-        class Slow(Mapper):
-            def optimized(self, grown: Grown, enough: Enough = never) -> Mapped:
-                while not (enough(1) or over.is_set()):  # as if one step took that long
-                    time.sleep(0.001)
-                return super().optimized(grown, enough)
-
-        slam = Slam(CONFIG, rasterizer, live=True, mapper=Slow)
+        slam = Slam(CONFIG, rasterizer, live=True, mapper=partial(Endless, over))
         left, sealed = list[int](), list[StepReport]()
         for frame in filmed(SEQUENCE):
             report = slam.step(frame)
@@ -268,15 +276,8 @@ class TestLive:
     def test_what_is_seen_for_the_first_time_does_not_wait_for_what_is_known(self, rasterizer: Rasterizer) -> None:
         """A camera that turns away from its map has more of it before the last of it is out of the picture."""
         over = threading.Event()
-
-        class Slow(Mapper):
-            def optimized(self, grown: Grown, enough: Enough = never) -> Mapped:
-                while not (enough(1) or over.is_set()):  # as if one step took that long
-                    time.sleep(0.001)
-                return super().optimized(grown, enough)
-
         one = with_settings(CONFIG, {"schedule.submap_distance": 9.0, "schedule.submap_angle": 180.0})
-        slam = Slam(one, rasterizer, live=True, mapper=Slow)
+        slam = Slam(one, rasterizer, live=True, mapper=partial(Endless, over))
         turning = RoomSequence(tuple(pose(degrees=(0.0, 1.5 * i, 0.0)) for i in range(50)))
         reports = [slam.step(frame) for frame in filmed(turning)]
         over.set()

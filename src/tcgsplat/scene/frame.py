@@ -42,8 +42,9 @@ class Frame:
 
     @property
     def measured(self) -> float:
-        """Share of the picture where a surface was measured."""
-        return float((self.valid & (self.depth > 0)).to(torch.float32).mean())
+        """Share of the valid pixels where a surface was measured; 0 if none is valid."""
+        surface = int(torch.count_nonzero(self.valid & (self.depth > 0)))
+        return surface / max(int(torch.count_nonzero(self.valid)), 1)
 
     def with_depth_later(self, seconds: float) -> "Frame":
         """The same frame whose depth image was taken so much later than it says."""
