@@ -211,8 +211,8 @@ class Slam:
         elsewhere = found.reference if found is not None and found.reference is not self.submap else None
 
         # Switch: seal the submap and anchor the next one at this camera (equation 16), which may be in an old submap.
-        may_end = tracked.converged and frame.has_depth
-        leaves = may_end and self._schedule.switches_submap(frame.index, T_map_cam, self.submap)
+        far = tracked.converged and self._schedule.switches_submap(frame.index, T_map_cam, self.submap)
+        leaves = far and frame.has_depth
         may_map = tracked.converged and not (self._live and self._updates)
         switches = leaves and may_map
         self._presses = leaves or (self._live and tracked.coverage < KNOWN * frame.measured)

@@ -91,6 +91,7 @@ class TestGuesses:
         found = localizer(rasterizer).localized(frame, corner, [])
         assert found.failed == "no guess"
         assert found.tracked.lost
+        assert found.tracked.coverage == 0
         assert np.array_equal(found.information, np.zeros((6, 6)))
 
     def test_the_second_is_used_where_the_first_fails(

@@ -60,7 +60,8 @@ class Localizer:
             guesses: `T_map_cam`, the best first. None at all is a failure, too.
         """
         frame = frame.to(submap.device)  # where its pictures are
-        found = Localized(Tracked(se3.identity(), "nothing tells where in the map it might be"), "no guess")
+        nowhere = Tracked(se3.identity(), "nothing tells where in the map it might be", coverage=0.0)
+        found = Localized(nowhere, "no guess")
         for guess in guesses:
             found = self._from(guess, frame, submap)
             if not found.failed:
