@@ -84,6 +84,14 @@ def run(finished: subprocess.CompletedProcess[str], tmp_path: Path) -> RunDirect
     return RunDirectory.open(Path(shutil.copytree(finished.args[-1], tmp_path / "room")))
 
 
+def test_a_run_imports_no_symbolic_mathematics(room_folder: Path, tmp_path: Path):
+    """Autograd does when it is handed derivatives of a whole picture, and a live camera waits a quarter of a second."""
+    told = "import sys; from tcgsplat.cli.main import main; sys.exit(main(sys.argv[1:]) or 'sympy' in sys.modules)"
+    arguments = ["run", str(room_folder), *SHORT_SUBMAPS, "--out", str(tmp_path / "run")]
+    done = subprocess.run([sys.executable, "-c", told, *arguments], capture_output=True, text=True, timeout=PATIENCE)
+    assert done.returncode == 0, done.stderr
+
+
 def test_run_is_quiet_in_a_pipe_and_leaves_a_whole_run(finished: subprocess.CompletedProcess[str]):
     assert finished.returncode == 0, finished.stderr
     assert finished.stderr == ""

@@ -76,6 +76,21 @@ def test_kernels_are_looked_for_without_linear_algebra_that_can_be_had_all_the_s
     assert done.returncode == 0, done.stderr
 
 
+def test_imports_are_kept_from_the_collector_of_garbage_and_what_comes_later_is_not():
+    done = python(
+        "import gc; from tcgsplat.cli.ahead import compiled_meanwhile\n"
+        "with compiled_meanwhile():\n"
+        "    import torch\n"
+        "    assert not gc.isenabled()\n"
+        "frozen = gc.get_freeze_count()\n"
+        "assert gc.isenabled() and frozen > 100_000, frozen\n"
+        "with compiled_meanwhile():\n"
+        "    assert gc.isenabled()\n"
+        "assert gc.get_freeze_count() <= frozen\n"
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def test_help_lists_every_command_and_every_command_is_there(capsys: pytest.CaptureFixture[str]):
     assert main(["--help"]) == 0
     text = capsys.readouterr().out

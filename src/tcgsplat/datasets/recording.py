@@ -145,7 +145,7 @@ class Recording:
         Raises:
             DatasetError: if no frame can be read, sizes are wrong, or the depth scale cannot be right.
         """
-        sample = np.unique(np.linspace(0, len(self) - 1, SAMPLED).round().astype(int)).tolist()
+        sample = sorted(set(np.linspace(0, len(self) - 1, SAMPLED).round().astype(int).tolist()))
         others = [i for i in range(len(self)) if i not in sample]
         depths: list[NDArray[np.float32]] = []
         problem: UnreadableImageError | None = None
