@@ -17,7 +17,7 @@ import torch
 
 from tcgsplat.config import SlamConfig
 from tcgsplat.geometry import se3
-from tcgsplat.loop.closer import Closure, LoopCloser
+from tcgsplat.loop.closer import Closure, LoopCloser, import_late_modules
 from tcgsplat.loop.edge import Edge, odometry
 from tcgsplat.loop.places import measured
 from tcgsplat.loop.relocalization import Relocalized
@@ -140,6 +140,8 @@ class Slam:
         self._closer = LoopCloser(
             config.loop, config.tracker, config.confidence, rasterizer, self._store.load_submap, config.seed
         )
+        if live and config.loop.enabled:
+            import_late_modules()
         behind = step_back if live else None  # a camera's next frame does not wait
         self._mapping_thread = ThreadPoolExecutor(1, thread_name_prefix="mapping", initializer=behind)
         self._growing: Future[Grown] | None = None

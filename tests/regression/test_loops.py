@@ -1,9 +1,12 @@
 """The whole online system where a camera comes back: loops, places known again, and a run that goes on."""
 
 import math
+import subprocess
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -227,6 +230,36 @@ class TestLoop:
 
     def test_switched_off_nothing_that_was_said_moves(self, open_ended: Run) -> None:
         assert all(torch.equal(S, T) for S, T in zip(open_ended.seen, open_ended.T_world_cam, strict=True))
+
+
+def test_a_live_system_imports_nothing_while_frames_come(easy_walk: Path) -> None:
+    """In a process of its own, since this one has long imported all; in the ordinary mode, where a loop is closed."""
+    done = subprocess.run(
+        [sys.executable, "-c", STEPPED_AFTER_LIVE, str(easy_walk)], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert set(done.stdout.split()) <= {"tcgsplat", "encodings"}
+
+
+STEPPED_AFTER_LIVE = """
+import sys
+from pathlib import Path
+from tcgsplat import SlamConfig, open_rasterizer
+from tcgsplat.cli.kernels import compile_kernels
+from tcgsplat.datasets import open_sequence
+from tcgsplat.slam import Slam
+
+config, rasterizer = SlamConfig(), open_rasterizer("numba")
+compile_kernels(config, rasterizer)
+frames = list(open_sequence(Path(sys.argv[1])).frames_from(0))
+Slam(config, rasterizer, live=True)
+before, slam = set(sys.modules), Slam(config, rasterizer)
+for frame in frames:
+    slam.step(frame)
+slam.finish()
+assert any(edge.loop for edge in slam.closures[-1].edges), "no loop was closed"
+print(*(name.split(".")[0] for name in set(sys.modules) - before))
+"""
 
 
 class TestResumed:

@@ -8,6 +8,8 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
+from typing import Final
 
 from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.geometry import se3
@@ -25,6 +27,20 @@ from tcgsplat.tensors import Pose
 from tcgsplat.tracking.tracker import TrackerConfig
 
 logger = logging.getLogger(__name__)
+
+LATE: Final = (
+    "tcgsplat.loop.pose_graph",  # and with it gtsam
+    "scipy.sparse.csgraph",
+    "scipy.spatial.transform",
+    "scipy.special",
+)
+"""What is imported only when a submap is first compared or a loop closed, so that a run begins sooner."""
+
+
+def import_late_modules() -> None:
+    """Import it now: later it would hold up all threads for 0.1 and 0.2 s, and a camera does not wait."""
+    for module in LATE:
+        import_module(module)
 
 
 @dataclass(frozen=True, eq=False)
