@@ -21,7 +21,7 @@ from tcgsplat.errors import ConfigError
 from tcgsplat.loop.settings import LoopConfig
 from tcgsplat.mapping.schedule import ScheduleConfig
 from tcgsplat.mapping.settings import MapperConfig
-from tcgsplat.tracking.tracker import TrackerConfig
+from tcgsplat.tracking.settings import TrackerConfig
 
 Value = bool | int | float | str | tuple[bool | int | float | str, ...]
 """What a setting can be."""

@@ -9,15 +9,17 @@ import pytest
 import torch
 
 from tcgsplat.geometry import se3
+from tcgsplat.geometry.camera import Camera
 from tcgsplat.tracking import alignment_kernels as kernels
-from tcgsplat.tracking.alignment import normal_equations, reference_points
-from tcgsplat.tracking.pyramids import live_image
+from tcgsplat.tracking import pyramids
+from tcgsplat.tracking.alignment import normal_equations
 
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
 
 HEIGHT, WIDTH = 48, 70
 FX, FY, CX, CY = 61.0, 62.5, 34.2, 23.1
+SEEN_BY = Camera(FX, FY, CX, CY, WIDTH, HEIGHT)
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class Scene:
         return constants
 
     def sums(self) -> Doubles:
-        live = live_image(self.intensity, self.depth)
+        live = pyramids.sampled(self.intensity, self.depth)
         live[[0, -1]] = live[:, [0, -1]] = np.nan  # no pass may ask for the border
         return normal_equations(self.points, live, self.constants)  # type: ignore[no-any-return]
 
@@ -294,8 +296,7 @@ def expected_points(
 def test_reference_points(seed: int, radius: int, stride: int) -> None:
     random = scene(seed)
     weight = np.random.default_rng(seed).random((HEIGHT, WIDTH), np.float32)
-    intrinsics = np.array([FX, FY, CX, CY], np.float32)
-    points = reference_points(random.intensity, random.depth, weight, intrinsics, radius, stride)
+    points = pyramids.points(random.intensity, random.depth, weight, SEEN_BY, radius, stride)
     assert points.shape[1] % 16 == 0
     found = points[:, points[kernels.PZ] != 0]
     true = expected_points(random.intensity, random.depth, weight, radius, stride)
@@ -308,13 +309,13 @@ def test_reference_points(seed: int, radius: int, stride: int) -> None:
 @pytest.mark.parametrize("size", [(3, 40), (5, 5), (6, 21), (40, 4)])
 def test_reference_points_of_small_pictures(size: tuple[int, int]) -> None:
     depth = np.full(size, 2.0, np.float32)
-    points = reference_points(depth, depth, depth, np.array([FX, FY, CX, CY], np.float32), 1, 1)
+    points = pyramids.points(depth, depth, depth, SEEN_BY, 1, 1)
     assert np.count_nonzero(points[kernels.PZ]) == max(size[0] - 4, 0) * max(size[1] - 4, 0)
 
 
 def test_what_a_pass_samples() -> None:
     random = scene(3)
-    live = live_image(random.intensity, random.depth)[1:-1, 1:-1]
+    live = pyramids.sampled(random.intensity, random.depth)[1:-1, 1:-1]
     image = random.intensity
     np.testing.assert_array_equal(live[..., 0], image[1:-1, 1:-1])
     np.testing.assert_allclose(live[..., 1], (image[1:-1, 2:] - image[1:-1, :-2]) / 2, rtol=1e-6)

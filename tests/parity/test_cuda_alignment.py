@@ -14,8 +14,10 @@ from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.cuda.launching import Compiled, Kernels, compiled, nvrtc_library
 from tcgsplat.render.view import Rendering
 from tcgsplat.scene.frame import Frame
-from tcgsplat.tracking import cuda_alignment
-from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, align, reference_view
+from tcgsplat.tracking import cuda_alignment, pyramids
+from tcgsplat.tracking.alignment import Alignment, align
+from tcgsplat.tracking.reference import reference_view
+from tcgsplat.tracking.settings import AlignmentConfig
 
 EMULATED = pytest.param(
     "emulated", marks=pytest.mark.skipif(COMPILER is None, reason="no C++ compiler to emulate with")
@@ -70,11 +72,12 @@ def both(
 ) -> tuple[Alignment, Alignment]:
     g = torch.Generator().manual_seed(5)
     weight = 0.3 + 0.7 * torch.rand(live.depth.shape, generator=g)
-    on_cpu = align(live, reference_view(rendering, weight, live.camera, T_LIVE, config), GUESS, config)
+    on_cpu = align(live, reference_view(pyramids, rendering, weight, live.camera, T_LIVE, config), GUESS, config)
     compiled_kernels, device = kernels
     there = rendering.to(device), weight.to(device), live.camera
-    view = cuda_alignment.reference_view(compiled_kernels, *there, T_LIVE, config)
-    return on_cpu, cuda_alignment.align(compiled_kernels, live.to(device), view, GUESS, config)
+    images = cuda_alignment.Images(compiled_kernels)
+    view = reference_view(images, *there, T_LIVE, config)
+    return on_cpu, cuda_alignment.align(images, live.to(device), view, GUESS, config)
 
 
 @pytest.mark.parametrize(

@@ -45,9 +45,9 @@ from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.slam import Slam
 from tcgsplat.storage.run_directory import RunDirectory
 from tcgsplat.storage.world_map import newly_merged
-from tcgsplat.tracking.alignment import AlignmentConfig
 from tcgsplat.tracking.descent import DescentConfig, descend
-from tcgsplat.tracking.tracker import Tracker, TrackerConfig
+from tcgsplat.tracking.settings import AlignmentConfig, TrackerConfig
+from tcgsplat.tracking.tracker import Tracker
 
 T_TRUE = pose(0.01, -0.006, 0.012, degrees=(0.4, 0.6, -0.3))
 ALIGNMENT = TrackerConfig(alignment=AlignmentConfig(iterations=(4, 3, 3), stride=2))

@@ -27,8 +27,7 @@ from tcgsplat.scene.submap import Submap
 from tcgsplat.slam import Slam, StepReport
 from tcgsplat.storage.checkpoint import Checkpoint
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.alignment import AlignmentConfig
-from tcgsplat.tracking.tracker import TrackerConfig
+from tcgsplat.tracking.settings import AlignmentConfig, TrackerConfig
 
 CONFIG = SlamConfig(
     tracker=TrackerConfig(

@@ -30,8 +30,8 @@ from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Keyframe, Submap
 from tcgsplat.slam import KNOWN, Slam, StepReport
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.alignment import AlignmentConfig
-from tcgsplat.tracking.tracker import Tracker, TrackerConfig
+from tcgsplat.tracking.settings import AlignmentConfig, TrackerConfig
+from tcgsplat.tracking.tracker import Tracker
 
 CONFIG = SlamConfig(
     tracker=TrackerConfig(solver="alignment", alignment=AlignmentConfig(iterations=(4, 3, 3), stride=2)),

@@ -13,10 +13,12 @@ from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.view import Rendering
 from tcgsplat.scene.frame import Frame
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking import alignment
+from tcgsplat.tracking import alignment, pyramids
 from tcgsplat.tracking import alignment_kernels as kernels
-from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, _exp, align, correlation, reference_view
-from tcgsplat.tracking.pyramids import halved, halved_depth, live_image, live_view, luma, rendered_view
+from tcgsplat.tracking.alignment import Alignment, _exp, align, correlation
+from tcgsplat.tracking.pyramids import halved, halved_depth, luma
+from tcgsplat.tracking.reference import reference_view
+from tcgsplat.tracking.settings import AlignmentConfig
 
 CONFIG = AlignmentConfig(
     iterations=(8, 5, 5), stride=1, depth_weight=1.0, min_alpha=0.7, gate=0.05, sigma_floor=0.0017, sigma_slope=0.0019
@@ -39,7 +41,7 @@ def at_once(
 ) -> Alignment:
     """To a view from the very guess."""
     T = se3.identity() if T_map_ref is None else T_map_ref
-    return align(live, reference_view(rendering, weight, live.camera, T, config), T, config)
+    return align(live, reference_view(pyramids, rendering, weight, live.camera, T, config), T, config)
 
 
 def normal_equations(
@@ -57,7 +59,7 @@ def normal_equations(
     T = se3.exp(torch.from_numpy(tangent)).numpy()
     intrinsics, settings = (camera.fx, camera.fy, camera.cx, camera.cy), (0.05, depth_weight, 0.0017, 0.0019)
     constants = np.array([*T[:3, :3].flat, *T[:3, 3], *intrinsics, 1.0, 0.0, 0.05, 2.0, *settings], np.float32)
-    sums = alignment.normal_equations(padded, live_image(intensity, depth), constants)
+    sums = alignment.normal_equations(padded, pyramids.sampled(intensity, depth), constants)
     H = np.zeros((6, 6))
     H[np.triu_indices(6)] = sums[:21]
     return H + np.triu(H, 1).T, sums[21:27], sums
@@ -65,9 +67,8 @@ def normal_equations(
 
 def points_of(frame: Frame, stride: int = 1) -> np.ndarray:
     """The points of a frame [n, POINT]."""
-    camera, ones = frame.camera, np.ones((CAMERA.height, CAMERA.width), np.float32)
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-    points = alignment.reference_points(luma(frame.color), frame.depth.numpy(), ones, intrinsics, 1, stride)
+    ones = np.ones((CAMERA.height, CAMERA.width), np.float32)
+    points = pyramids.points(luma(frame.color), frame.depth.numpy(), ones, frame.camera, 1, stride)
     return points[:, points[kernels.PZ] > 0].T
 
 
@@ -194,16 +195,18 @@ class TestKernels:
         np.testing.assert_allclose(luma(planar), grey, rtol=1e-6)
 
         frame = replace(Room().frame(), color=torch.from_numpy(color), depth=torch.from_numpy(depth))
-        intensity, marked = live_view(replace(frame, valid=torch.from_numpy(alpha > 0.5)))
+        intensity, marked = pyramids.live(replace(frame, valid=torch.from_numpy(alpha > 0.5)))
         np.testing.assert_allclose(intensity, grey, rtol=1e-6)
         np.testing.assert_array_equal(marked, np.where(alpha > 0.5, depth, -1))
 
         seen = replace(frame, color=planar, valid=torch.ones(60, 80, dtype=torch.bool))
         rendering = rendering_of(seen, alpha=torch.from_numpy(alpha))
-        intensity, marked = rendered_view(rendering, luma(rendering.color), 0.5)
+        intensity, marked, composited, solid = pyramids.rendered(rendering, 0.5)
         np.testing.assert_allclose(intensity[alpha > 1e-3], grey[alpha > 1e-3], rtol=1e-5)
         assert not intensity[0, :2].any()
         np.testing.assert_allclose(marked, np.where(alpha > 0.5, depth, -1), rtol=1e-6)
+        np.testing.assert_array_equal(composited, luma(rendering.color))
+        np.testing.assert_array_equal(solid, np.where(alpha > 0.95, marked, -1))
 
     def test_halved_pictures(self) -> None:
         image = np.arange(35, dtype=np.float32).reshape(5, 7)  # the odd row and column fall off
@@ -242,7 +245,7 @@ class TestKernels:
         image, depth = (np.random.default_rng(seed).random(size, np.float32) for seed in (0, 1))
         dv, du = np.gradient(image)
         expected = np.stack((image, du, dv, depth), axis=-1)[1:-1, 1:-1]
-        np.testing.assert_allclose(live_image(image, depth)[1:-1, 1:-1], expected, atol=1e-6)
+        np.testing.assert_allclose(pyramids.sampled(image, depth)[1:-1, 1:-1], expected, atol=1e-6)
 
 
 T_NEAR = pose(0.02, -0.015, 0.015, degrees=(1.0, -1.4, 1.0))
@@ -280,12 +283,12 @@ def test_the_pose_of_the_view_is_where_it_starts_from(room: Room) -> None:
 @pytest.mark.parametrize("T_true", [T_NEAR, pose(0.03, -0.01, 0.02, degrees=(1.0, -2.0, 0.5))])
 def test_one_view_does_for_several_frames(room: Room, T_true: Pose) -> None:
     """What is found does not depend on how far the guess is from where the view was rendered."""
-    view = reference_view(rendering_of(room.frame()), EVERYWHERE, CAMERA, se3.identity(), CONFIG)
+    view = reference_view(pyramids, rendering_of(room.frame()), EVERYWHERE, CAMERA, se3.identity(), CONFIG)
     near, far = (align(room.frame(T_true), view, guess, CONFIG) for guess in (T_true, se3.identity()))
     assert errors(near.T_map_cam, far.T_map_cam)[0] < 0.05
     assert errors(near.T_map_cam, T_true)[0] < 1
     hasty = replace(CONFIG, iterations=(1, 0, 0))
-    view = reference_view(rendering_of(room.frame()), EVERYWHERE, CAMERA, se3.identity(), hasty)
+    view = reference_view(pyramids, rendering_of(room.frame()), EVERYWHERE, CAMERA, se3.identity(), hasty)
     near, far = (align(room.frame(T_true), view, guess, hasty) for guess in (T_true, se3.identity()))
     assert 2 * errors(near.T_map_cam, T_true)[0] < errors(far.T_map_cam, T_true)[0]
 

@@ -17,8 +17,8 @@ from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.gaussians import Gaussians
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.alignment import AlignmentConfig
-from tcgsplat.tracking.tracker import Tracked, TrackerConfig
+from tcgsplat.tracking.settings import AlignmentConfig, TrackerConfig
+from tcgsplat.tracking.tracker import Tracked
 
 T_TRUE = pose(0.05, -0.03, 0.04, degrees=(1.5, -2.0, 1.0))
 T_NEAR = T_TRUE @ pose(0.03, 0.02, -0.03, degrees=(-1.5, 1.0, 1.0))

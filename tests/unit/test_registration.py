@@ -32,7 +32,7 @@ from tcgsplat.loop.settings import LoopConfig
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.tracker import TrackerConfig
+from tcgsplat.tracking.settings import TrackerConfig
 
 T_WORLD_A = [pose(0.05 * i, 0, 0.02 * i, degrees=(0, -4 * i, 0)) for i in range(3)]
 T_WORLD_B = [

@@ -19,9 +19,12 @@ from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.alignment import AlignmentConfig, align, reference_view
+from tcgsplat.tracking import pyramids
+from tcgsplat.tracking.alignment import align
 from tcgsplat.tracking.descent import DescentConfig
-from tcgsplat.tracking.tracker import Tracker, TrackerConfig
+from tcgsplat.tracking.reference import reference_view
+from tcgsplat.tracking.settings import AlignmentConfig, TrackerConfig
+from tcgsplat.tracking.tracker import Tracker
 
 T_TRUE = pose(0.01, -0.006, 0.012, degrees=(0.4, 0.6, -0.3))
 ALIGNMENT = TrackerConfig(
@@ -214,7 +217,7 @@ def test_only_what_is_all_but_opaque_tells_the_exposure(alpha: float) -> None:
     thin = torch.zeros_like(frame.valid)
     thin[:, 40:] = True
     rendering, config = rendering_of(frame, alpha=torch.where(thin, alpha, 1.0)), AlignmentConfig()
-    view = reference_view(rendering, torch.ones_like(frame.depth), frame.camera, se3.identity(), config)
+    view = reference_view(pyramids, rendering, torch.ones_like(frame.depth), frame.camera, se3.identity(), config)
     for shown in (0.0, 0.5):  # behind the thin half, black or grey shows through
         color = torch.where(thin[..., None], alpha * frame.color + (1 - alpha) * shown, frame.color)
         found = align(replace(frame, color=color), view, se3.identity(), config)
@@ -226,7 +229,7 @@ def test_the_exposure_is_found_at_the_finest_level_that_has_passes(iterations: t
     frame, exposure = Room().frame(), Exposure(0.7, 0.1)
     exposed, config = replace(frame, color=exposure.applied(frame.color)), AlignmentConfig(iterations=iterations)
     rendering, everywhere = rendering_of(frame, alpha=1.0), torch.ones_like(frame.depth)
-    view = reference_view(rendering, everywhere, frame.camera, se3.identity(), config)
+    view = reference_view(pyramids, rendering, everywhere, frame.camera, se3.identity(), config)
     found = align(exposed, view, se3.identity(), config).exposure
     middle = float(frame.color.mean())
     assert found.gain * middle + found.offset == pytest.approx(exposure.gain * middle + exposure.offset, abs=0.01)

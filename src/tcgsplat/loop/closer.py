@@ -24,7 +24,7 @@ from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.tracker import TrackerConfig
+from tcgsplat.tracking.settings import TrackerConfig
 
 logger = logging.getLogger(__name__)
 

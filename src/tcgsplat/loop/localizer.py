@@ -14,7 +14,8 @@ from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.tracker import Tracked, Tracker, TrackerConfig
+from tcgsplat.tracking.settings import TrackerConfig
+from tcgsplat.tracking.tracker import Tracked, Tracker
 
 ALIKE = 64
 """Residuals that count as one measurement: those of neighbouring pixels are alike. With it, the errors of registered

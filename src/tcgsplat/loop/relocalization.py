@@ -15,7 +15,8 @@ from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking.tracker import Tracked, TrackerConfig
+from tcgsplat.tracking.settings import TrackerConfig
+from tcgsplat.tracking.tracker import Tracked
 
 _CLEARLY: Final = 0.01
 """Correlation of colours by which one place must be better than another one. In two synthetic rooms that differ by a

@@ -13,16 +13,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
-from tcgsplat.geometry.camera import Camera
-from tcgsplat.render.numba_cpu.simd import LANES
-from tcgsplat.render.view import Rendering
 from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.frame import Frame
-from tcgsplat.tensors import Plane, Pose
+from tcgsplat.tensors import Pose
 from tcgsplat.tracking import alignment_kernels as kernels
-from tcgsplat.tracking.pyramids import NOTHING, halved, halved_depth, live_image, live_view, luma, rendered_view
+from tcgsplat.tracking import pyramids
+from tcgsplat.tracking.reference import Level, Pair, ReferenceView, pairs
+from tcgsplat.tracking.settings import AlignmentConfig
 
 Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
@@ -33,12 +31,6 @@ MAX_GAIN = 2.5
 """Of a picture over its submap's first, and its inverse: two to three stops, since colours are not linear in light."""
 FLAT_VARIANCE = 0.002
 """Variance of intensity, grey levels squared, that a gain of 1 is worth: an image flatter than that keeps it."""
-_COARSEST = 80
-"""Pixels across the coarsest level, at most: a pixel there is most of a degree, what a fast hand turns in a frame."""
-SPARSE = 200
-"""Pixels across from which on a level is sampled by `stride`: above it, neighbours say nearly the same."""
-SOLID = 0.95
-"""Alpha from which on a pixel tells the exposure."""
 STEP_PRIOR = 0.05
 """Spread of a step that is expected before anything is seen, metres and radians."""
 SMALL = 3e-4
@@ -48,42 +40,6 @@ COLOR_SCALE, DEPTH_SCALE = 0.05, 2.0
 _LOW, _HIGH = np.sort(np.indices((6, 6)), axis=0)
 _HESSIAN_ENTRY = kernels.HESSIAN + 6 * _LOW - _LOW * (_LOW - 1) // 2 + _HIGH - _LOW
 """Where each entry of the symmetric H is among the sums."""
-
-
-@dataclass(frozen=True)
-class AlignmentConfig:
-    """Constants of the solver. [ours]: measured on six sequences (design/tracking-recipe.md)."""
-
-    iterations: tuple[int, ...] = (5, 3, 3)
-    """Passes a level, finest first: full, half, quarter resolution; images more than 320 pixels wide get further
-    levels with the passes of the last. [ours]"""
-    stride: int = 3
-    """Every how many pixels a point is taken where a level is more than 200 pixels wide; else all are. [ours]"""
-    depth_weight: float = 0.7
-    """Geometry over colour, after each has been divided by its own spread. [ours]"""
-    min_alpha: float = 0.7
-    """Rendered pixels below this coverage give no point. [ours]"""
-    gate: float = 0.05
-    """Metres, times (1 + z/2): depth that disagrees by more is another surface; doubled at coarse levels. [ours]"""
-    sigma_floor: float = 0.0017
-    """Depth noise at 0.4 m, metres: a structured-light sensor's (Nguyen et al. 2012) and some for the map. [ours]"""
-    sigma_slope: float = 0.0019
-    """Growth of depth noise with the square of the distance beyond 0.4 m, 1/metre. [ours]"""
-
-    def __post_init__(self) -> None:
-        if not self.iterations or min(self.iterations) < 0 or sum(self.iterations) == 0:
-            raise ConfigError(
-                f"tracker.alignment.iterations is {self.iterations!r}; give passes for every level, finest first, "
-                "such as [3, 2, 3]"
-            )
-        if self.stride < 1:
-            raise ConfigError(f"tracker.alignment.stride is {self.stride!r}; it must be at least 1")
-        for name in ("gate", "sigma_floor"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"tracker.alignment.{name} is {getattr(self, name)!r}; it must be above 0 metres")
-        for name in ("depth_weight", "sigma_slope"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"tracker.alignment.{name} is {getattr(self, name)!r}; it must be at least 0")
 
 
 @dataclass(frozen=True)
@@ -118,116 +74,11 @@ class Alignment:
     """What depth alone asks for there."""
 
 
-def reference_points(
-    intensity: Floats, depth: Floats, weight: Floats, intrinsics: Floats, radius: int, stride: int
-) -> Floats:
-    """Points of a view [POINT, n]; images are [h, w] and contiguous; see the kernel of this name."""
-    h, w = depth.shape
-    n = LANES * len(range(2, h - 2, stride)) * len(range(2, w - 2, stride * LANES))
-    points: Floats = np.empty((kernels.POINT, n), np.float32)
-    images = (image.reshape(-1) for image in (intensity, depth, weight))
-    kernels.reference_points(*images, h, w, intrinsics, radius, stride, n, points.reshape(-1))
-    return points
-
-
 def normal_equations(points: Floats, live: Floats, constants: Floats) -> Doubles:
     """The sums of one pass over points [POINT, n] and a live image [h, w, CHANNELS]; see the kernel of this name."""
     sums, (h, w, _) = np.zeros(kernels.SUMS), live.shape
     kernels.normal_equations(points.reshape(-1), points.shape[1], live.reshape(-1), h, w, constants, sums)
     return sums
-
-
-@dataclass(frozen=True)
-class Level:
-    """A rendered view at one resolution."""
-
-    passes: int
-    points: Floats
-    """[POINT, n]"""
-    intrinsics: Floats
-    """fx, fy, cx, cy, pixels."""
-    gate: float
-    """Metres, times (1 + z/2)."""
-
-
-@dataclass(frozen=True)
-class ReferenceView:
-    """A rendered view as frames are aligned to it: made once, used while the camera stays near."""
-
-    T_map_ref: Pose
-    """Where it was rendered."""
-    camera: Camera
-    covered: npt.NDArray[np.bool_]
-    """Where it gives points, [h, w]."""
-    levels: tuple[Level, ...]
-    """Finest first; those that have no passes, too, without points."""
-    solid_points: Floats
-    """Of the finest level with passes, that tell the exposure."""
-
-
-def passes_of_levels(config: AlignmentConfig, camera: Camera) -> tuple[int, ...]:
-    """Passes a level, finest first; large images get more coarse levels, so that a step spans as much of any image."""
-    more = max(math.ceil(math.log2(camera.width / _COARSEST)) + 1 - len(config.iterations), 0)
-    return (*config.iterations, *[config.iterations[-1]] * more)
-
-
-def reference_view(
-    rendering: Rendering, weight: Plane, camera: Camera, T_map_ref: Pose, config: AlignmentConfig
-) -> ReferenceView:
-    """A rendered view made ready.
-
-    The solver compares with colours that are divided by alpha. Through thin places the background of the map's frame
-    shows, which optimisation closes in time: dividing makes them too bright, not dividing leaves them too dark. So
-    exposure is told by colours that are not divided, where the map is all but opaque.
-
-    Args:
-        rendering: The map seen from `T_map_ref`, on the CPU.
-        weight: W_tr of Eq. 18 at every rendered pixel.
-        camera: That it was rendered with.
-        T_map_ref: Where.
-        config: Constants.
-    """
-    composited = luma(rendering.color)
-    intensity, depth = rendered_view(rendering, composited, config.min_alpha)
-    covered = depth >= 0
-    solid = np.where(rendering.alpha.numpy() > SOLID, depth, NOTHING)
-    weights, scaled = np.ascontiguousarray(weight.numpy()), camera
-    levels, nothing = list[Level](), np.empty((kernels.POINT, 0), np.float32)
-    solid_points: Floats = nothing
-    for number, passes in enumerate(passes_of_levels(config, camera)):
-        begun = any(level.passes for level in levels)
-        if number:
-            intensity, weights, depth = halved(intensity), halved(weights), halved_depth(depth)
-            if not begun:
-                composited, solid = halved(composited), halved_depth(solid)
-            scaled = scaled.scaled(0.5)
-        intrinsics = np.array([scaled.fx, scaled.fy, scaled.cx, scaled.cy], np.float32)
-        sampling = (2, config.stride) if scaled.width > SPARSE else (1, 1)
-        points = reference_points(intensity, depth, weights, intrinsics, *sampling) if passes else nothing
-        if passes and not begun:
-            solid_points = reference_points(composited, solid, weights, intrinsics, *sampling)
-        levels.append(Level(passes, points, intrinsics, 2 * config.gate if number else config.gate))
-    return ReferenceView(T_map_ref, camera, covered, tuple(levels), solid_points)
-
-
-@dataclass(frozen=True)
-class _Pair:
-    """Both views at one resolution."""
-
-    level: Level
-    live: Floats
-    """Of the frame, [h, w, CHANNELS]."""
-
-
-def _pairs(frame: Frame, view: ReferenceView) -> list[_Pair]:
-    """With the frame, at the levels that have passes; finest first."""
-    pairs, (live, depth) = list[_Pair](), live_view(frame)
-    for number, level in enumerate(view.levels):
-        if number:
-            live, depth = halved(live), halved_depth(depth)
-        if level.passes:
-            pairs.append(_Pair(level, live_image(live, depth)))
-    return pairs
 
 
 @dataclass
@@ -265,12 +116,13 @@ def correlation(weight: float, x: float, y: float, xx: float, xy: float, yy: flo
     return (xy / total - mean_x * mean_y + prior) / math.sqrt(variance_x * variance_y)
 
 
-def _constants(level: Level, T: Doubles, photometry: Photometry, config: AlignmentConfig) -> Floats:
+def _constants(level: Level[Floats], T: Doubles, photometry: Photometry, config: AlignmentConfig) -> Floats:
     """Of one pass, in the kernel's order."""
     constants = np.empty(kernels.CONSTANTS, np.float32)
     constants[kernels.ROTATION : kernels.TRANSLATION] = T[:3, :3].ravel()
     constants[kernels.TRANSLATION : kernels.INTRINSICS] = T[:3, 3]
-    constants[kernels.INTRINSICS : kernels.GAIN] = level.intrinsics
+    camera = level.camera
+    constants[kernels.INTRINSICS : kernels.GAIN] = camera.fx, camera.fy, camera.cx, camera.cy
     constants[kernels.GAIN : kernels.COLOR_SCALE] = photometry.gain, photometry.offset
     constants[kernels.COLOR_SCALE : kernels.GATE] = photometry.color_scale, photometry.depth_scale
     constants[kernels.GATE : kernels.SIGMA_FLOOR] = level.gate, config.depth_weight
@@ -278,7 +130,7 @@ def _constants(level: Level, T: Doubles, photometry: Photometry, config: Alignme
     return constants
 
 
-def _sums(pair: _Pair, T: Doubles, photometry: Photometry, config: AlignmentConfig) -> Doubles:
+def _sums(pair: Pair[Floats], T: Doubles, photometry: Photometry, config: AlignmentConfig) -> Doubles:
     """Of a pass over a level."""
     return normal_equations(pair.level.points, pair.live, _constants(pair.level, T, photometry, config))
 
@@ -309,7 +161,7 @@ def _exp(tangent: Doubles) -> Doubles:
     return T
 
 
-def align(frame: Frame, view: ReferenceView, guess: Pose, config: AlignmentConfig) -> Alignment:
+def align(frame: Frame, view: ReferenceView[Floats], guess: Pose, config: AlignmentConfig) -> Alignment:
     """Align a frame to a rendered view.
 
     Args:
@@ -318,11 +170,11 @@ def align(frame: Frame, view: ReferenceView, guess: Pose, config: AlignmentConfi
         guess: `T_map_cam` to start from.
         config: Constants.
     """
-    pairs = _pairs(frame, view)
-    finest = pairs[0]
+    views = pairs(pyramids, frame, view)
+    finest = views[0]
     T = (se3.inverse(guess) @ view.T_map_ref).numpy()  # reference camera to live camera
     photometry, sums, passes = Photometry(), np.zeros(kernels.SUMS), 0
-    for pair in reversed(pairs):
+    for pair in reversed(views):
         photometry.color_scale, photometry.depth_scale = COLOR_SCALE, DEPTH_SCALE
         for _ in range(pair.level.passes):
             sums = _sums(pair, T, photometry, config)

@@ -1,6 +1,6 @@
 """Direct alignment on a GPU: the solver of alignment.py, whose passes follow one another without being waited for."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -15,7 +15,10 @@ from tcgsplat.scene.frame import Frame
 from tcgsplat.tensors import Plane, Pose
 from tcgsplat.tracking import alignment as cpu
 from tcgsplat.tracking import alignment_kernels as cpu_kernels
-from tcgsplat.tracking.alignment import Alignment, AlignmentConfig, Photometry, concluded, passes_of_levels
+from tcgsplat.tracking.alignment import Alignment, Photometry, concluded
+from tcgsplat.tracking.pyramids import SOLID
+from tcgsplat.tracking.reference import Pair, ReferenceView, pairs
+from tcgsplat.tracking.settings import AlignmentConfig
 
 _POSE, _GAIN, _COLOR_SCALE, _DONE, _PASSES, _STATE = 0, 16, 18, 20, 21, 22  # as in the kernels' text
 _PADDED = 48
@@ -26,14 +29,8 @@ def alignment_text() -> str:
     shared = ("THIN", "SMOOTH", "TINY", "NEAREST", "FACING", "BASE", "STUDENT_DOF")
     solver = ("ENOUGH_FOR_EXPOSURE", "FLAT_VARIANCE", "MAX_GAIN", "STEP_PRIOR", "SMALL")
     constants = {name: f"{float(getattr(cpu_kernels, name))!r}f" for name in shared}
-    constants |= {"SOLID": f"{cpu.SOLID!r}f"} | {name: repr(getattr(cpu, name)) for name in solver}
+    constants |= {"SOLID": f"{SOLID!r}f"} | {name: repr(getattr(cpu, name)) for name in solver}
     return source(constants, "render/cuda/kernel.cuh", "tracking/alignment.cu")
-
-
-@cache
-def alignment_kernels(device: torch.device) -> Kernels:
-    """Compiled for a GPU."""
-    return Compiled(alignment_text(), device)
 
 
 @cache
@@ -44,40 +41,8 @@ def _photometry(device: torch.device) -> Tensor:
     return torch.tensor(start, dtype=torch.float64, device=device)
 
 
-@dataclass(frozen=True)
-class Level:
-    """A rendered view at one resolution."""
-
-    passes: int
-    points: Tensor
-    """[POINT, n]"""
-    camera: Camera
-    gate: float
-
-
-@dataclass(frozen=True)
-class CudaReferenceView:
-    """As `alignment.ReferenceView`, on a GPU."""
-
-    T_map_ref: Pose
-    """On the CPU."""
-    camera: Camera
-    covered: Tensor
-    levels: tuple[Level, ...]
-    solid_points: Tensor
-
-
-@dataclass(frozen=True)
-class _Pair:
-    """Both views at one resolution."""
-
-    level: Level
-    live: Tensor
-    """Of the frame, [h, w, CHANNELS]."""
-
-
-class _Images:
-    """The launches, by name."""
+class Images:
+    """The launches, by name: what alignment does with images on a GPU."""
 
     def __init__(self, kernels: Kernels) -> None:
         self._kernels = kernels
@@ -102,8 +67,19 @@ class _Images:
         })  # fmt: skip
         return intensity, depth
 
-    def halved(self, kind: str, image: Tensor) -> Tensor:
-        """Half as wide and high; `kind` is intensity or depth."""
+    def weights(self, weight: Plane) -> Tensor:
+        """As the kernels read them."""
+        return weight.contiguous()
+
+    def halved(self, image: Tensor) -> Tensor:
+        """Means over two by two pixels."""
+        return self._halved("intensity", image)
+
+    def halved_depth(self, depth: Tensor) -> Tensor:
+        """Means of the readings of two by two pixels that agree."""
+        return self._halved("depth", depth)
+
+    def _halved(self, kind: str, image: Tensor) -> Tensor:
         (height, width), pitch = (side // 2 for side in image.shape), image.shape[1]
         half = image.new_empty(height, width)
         given = {"image": image, "half": half, "width": width, "height": height, "pitch": pitch}
@@ -133,7 +109,7 @@ class _Images:
         return points
 
     def passed(
-        self, pair: _Pair, state: Tensor, config: AlignmentConfig, *, balance: float, moves: bool, finest: bool
+        self, pair: Pair[Tensor], state: Tensor, config: AlignmentConfig, *, balance: float, moves: bool, finest: bool
     ) -> Tensor:
         """The sums of a pass [SUMS], after which the state follows if it moves."""
         level, (height, width, _) = pair.level, pair.live.shape
@@ -158,67 +134,27 @@ class _Images:
             self._kernels.launch(kernel, -(-count // THREADS), given)
 
 
-def reference_view(
-    kernels: Kernels, rendering: Rendering, weight: Plane, camera: Camera, T_map_ref: Pose, config: AlignmentConfig
-) -> CudaReferenceView:
-    """As `alignment.reference_view`, of a rendering on a GPU.
-
-    Args:
-        kernels: Of `alignment_text`, for that GPU.
-        rendering: The map seen from `T_map_ref`.
-        weight: W_tr of Eq. 18 at every rendered pixel.
-        camera: That it was rendered with.
-        T_map_ref: Where; on the CPU.
-        config: Constants.
-    """
-    images, weights, scaled, levels = _Images(kernels), weight.contiguous(), camera, list[Level]()
-    intensity, depth, composited, solid = images.rendered(rendering, config.min_alpha)
-    covered = depth >= 0
-    nothing = depth.new_empty(cpu_kernels.POINT, 0)
-    solid_points = nothing
-    for number, passes in enumerate(passes_of_levels(config, camera)):
-        begun = any(level.passes for level in levels)
-        if number:
-            intensity, weights = images.halved("intensity", intensity), images.halved("intensity", weights)
-            depth = images.halved("depth", depth)
-            if not begun:
-                composited, solid = images.halved("intensity", composited), images.halved("depth", solid)
-            scaled = scaled.scaled(0.5)
-        sampling = (2, config.stride) if scaled.width > cpu.SPARSE else (1, 1)
-        points = images.points(intensity, depth, weights, scaled, *sampling) if passes else nothing
-        if passes and not begun:
-            solid_points = images.points(composited, solid, weights, scaled, *sampling)
-        levels.append(Level(passes, points, scaled, 2 * config.gate if number else config.gate))
-    return CudaReferenceView(T_map_ref, camera, covered, tuple(levels), solid_points)
+@cache
+def images(device: torch.device) -> Images:
+    """Of a GPU, its kernels compiled."""
+    return Images(Compiled(alignment_text(), device))
 
 
-def _pairs(images: _Images, frame: Frame, view: CudaReferenceView) -> list[_Pair]:
-    """As `alignment._pairs`."""
-    pairs, (live, depth) = list[_Pair](), images.live(frame)
-    for number, level in enumerate(view.levels):
-        if number:
-            live, depth = images.halved("intensity", live), images.halved("depth", depth)
-        if level.passes:
-            pairs.append(_Pair(level, images.sampled(live, depth)))
-    return pairs
-
-
-def align(kernels: Kernels, frame: Frame, view: CudaReferenceView, guess: Pose, config: AlignmentConfig) -> Alignment:
+def align(images: Images, frame: Frame, view: ReferenceView[Tensor], guess: Pose, config: AlignmentConfig) -> Alignment:
     """As `alignment.align`, with all images on a GPU; the host waits once, for what was found.
 
     Args:
-        kernels: Of `alignment_text`, for that GPU.
+        images: Of that GPU.
         frame: The live frame, of the view's camera.
         view: Of the map, from somewhere near.
         guess: `T_map_cam` to start from; on the CPU.
         config: Constants.
     """
-    images = _Images(kernels)
-    pairs = _pairs(images, frame, view)
-    finest, start = pairs[0], _photometry(frame.depth.device)
+    views = pairs(images, frame, view)
+    finest, start = views[0], _photometry(frame.depth.device)
     T_live_ref = (se3.inverse(guess) @ view.T_map_ref).to(start.device, non_blocking=True)
     state, last = torch.cat((T_live_ref.flatten(), start)), start.new_zeros(cpu_kernels.SUMS)
-    for pair in reversed(pairs):
+    for pair in reversed(views):
         state[_COLOR_SCALE : _DONE + 1] = start[_COLOR_SCALE - _GAIN : _DONE + 1 - _GAIN]
         for _ in range(pair.level.passes):
             last = images.passed(pair, state, config, balance=config.depth_weight, moves=True, finest=pair is finest)

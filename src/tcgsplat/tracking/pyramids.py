@@ -1,7 +1,7 @@
-"""Images as alignment compares them: intensity, and depth that tells what saw nothing, at full size and halved.
+"""Images as alignment compares them, on the CPU: intensity, and depth that tells what saw nothing, whole and halved.
 
 Depth images mark pixels that saw nothing of the world (the empty border of an undistorted image) by NOTHING, pixels
-without a reading by 0.
+without a reading by 0. This module is the CPU's `reference.Images`.
 """
 
 from typing import Final
@@ -10,14 +10,18 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from tcgsplat.geometry.camera import Camera
+from tcgsplat.render.numba_cpu.simd import LANES
 from tcgsplat.render.view import Rendering
 from tcgsplat.scene.frame import Frame
-from tcgsplat.tensors import Image
+from tcgsplat.tensors import Image, Plane
 from tcgsplat.tracking import alignment_kernels as kernels
 
 Floats = npt.NDArray[np.float32]
 
 NOTHING: Final = np.float32(-1)
+SOLID: Final = 0.95
+"""Alpha from which on a pixel tells the exposure."""
 _RED, _GREEN, _BLUE = np.float32(0.299), np.float32(0.587), np.float32(0.114)
 
 
@@ -36,22 +40,28 @@ def halved(image: Floats) -> Floats:
     return cv2.resize(image[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
 
 
-def live_view(frame: Frame) -> tuple[Floats, Floats]:
+def live(frame: Frame) -> tuple[Floats, Floats]:
     """Intensity and marked depth of a frame: what is not valid saw nothing."""
     return luma(frame.color), np.where(frame.valid.numpy(), frame.depth.numpy(), NOTHING)
 
 
-def rendered_view(rendering: Rendering, composited: Floats, min_alpha: float) -> tuple[Floats, Floats]:
+def rendered(rendering: Rendering, min_alpha: float) -> tuple[Floats, Floats, Floats, Floats]:
     """Intensity and marked depth without the background: what is hardly covered saw nothing.
 
-    So its black does not bleed into the coarse levels' points. `composited` is the rendering's intensity, with it.
+    So its black does not bleed into the coarse levels' points. Then intensity with it, and depth of what is solid.
     """
+    composited = luma(rendering.color)
     alpha: Floats = rendering.alpha.numpy()
     inverse = np.maximum(alpha, kernels.THIN)
     np.divide(np.float32(1), inverse, out=inverse)
     intensity, depth = composited * inverse, rendering.composited_plane_depth.numpy() * inverse
     depth[alpha <= min_alpha] = NOTHING
-    return intensity, depth
+    return intensity, depth, composited, np.where(alpha > SOLID, depth, NOTHING)
+
+
+def weights(weight: Plane) -> Floats:
+    """As the kernels read them."""
+    return np.ascontiguousarray(weight.numpy())
 
 
 def halved_depth(depth: Floats) -> Floats:
@@ -62,7 +72,18 @@ def halved_depth(depth: Floats) -> Floats:
     return out
 
 
-def live_image(intensity: Floats, depth: Floats) -> Floats:
+def points(intensity: Floats, depth: Floats, weight: Floats, camera: Camera, radius: int, stride: int) -> Floats:
+    """Points of a rendered view [POINT, n], with normals from neighbours at `radius`, every `stride` pixels."""
+    h, w = depth.shape
+    n = LANES * len(range(2, h - 2, stride)) * len(range(2, w - 2, stride * LANES))
+    out: Floats = np.empty((kernels.POINT, n), np.float32)
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+    images = (image.reshape(-1) for image in (intensity, depth, weight))
+    kernels.reference_points(*images, h, w, intrinsics, radius, stride, n, out.reshape(-1))
+    return out
+
+
+def sampled(intensity: Floats, depth: Floats) -> Floats:
     """What a pass samples, [h, w, CHANNELS]: intensity, its slopes along u and v, depth. The border stays empty."""
     h, w = depth.shape
     out: Floats = np.empty((h, w, kernels.CHANNELS), np.float32)

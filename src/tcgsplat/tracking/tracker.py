@@ -4,15 +4,14 @@ A failure is a result: the frame is reported lost, keeps the predicted pose, and
 """
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 
 from tcgsplat.confidence import equations as eq
 from tcgsplat.confidence.state import ConfidenceConfig
-from tcgsplat.errors import ConfigError
 from tcgsplat.geometry import se3
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.protocol import Rasterizer
@@ -21,66 +20,12 @@ from tcgsplat.scene.exposure import UNCHANGED, Exposure
 from tcgsplat.scene.frame import Frame
 from tcgsplat.scene.submap import Submap
 from tcgsplat.tensors import Pose
-from tcgsplat.tracking import cuda_alignment
-from tcgsplat.tracking.alignment import (
-    AlignmentConfig,
-    Equations,
-    ReferenceView,
-    align,
-    correlation,
-    reference_view,
-)
-from tcgsplat.tracking.cuda_alignment import CudaReferenceView
-from tcgsplat.tracking.descent import DescentConfig, descend
+from tcgsplat.tracking import cuda_alignment, pyramids
+from tcgsplat.tracking.alignment import Equations, align, correlation
+from tcgsplat.tracking.descent import descend
 from tcgsplat.tracking.pyramids import luma
-
-
-@dataclass(frozen=True)
-class TrackerConfig:
-    """Which solver, and when its answer is not believed."""
-
-    solver: Literal["alignment", "descent"] = "alignment"
-    """`alignment`: Gauss-Newton against one render; `descent`: the paper's Adam through the rasterizer. [ours]"""
-    synchronization: Literal["none", "stamps", "learnt"] = "learnt"
-    """What is done about the time between colour and depth: nothing; the depth image is moved to the instant of the
-    colour image by the camera's velocity; so, and what the time stamps conceal is learnt from the motion. [ours]"""
-    smoothing: bool = True
-    """Whether depth is smoothed within its surfaces before anything else is done with it: a sensor that rounds makes
-    the camera seem to move too little. [ours]"""
-    exposure: bool = True
-    """Whether the map keeps one brightness and every picture its exposure beside it, as `alignment` finds it; else
-    pictures are mapped as they come. [ours]"""
-    view_distance: float = 0.02
-    """`alignment`: metres between a frame's guess and where the map was rendered, up to which it is aligned to that
-    view. Half as far again changed no trajectory by a tenth; from 5 cm and degrees on, frames were lost. [ours]"""
-    view_angle: float = 2.0
-    """`alignment`: the same, degrees. [ours]"""
-    alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
-    descent: DescentConfig = field(default_factory=DescentConfig)
-    max_step: float = 0.3
-    """Metres from the guess; a hand at 30 Hz misses a constant-velocity guess by centimetres. [ours]"""
-    max_turn: float = 30.0
-    """Degrees from the guess. [ours]"""
-    min_overlap: float = 0.1
-    """Share of the rendered view that must fall into the live image. [ours]"""
-    min_agreement: float = 0.3
-    """Share of the overlap whose depth must agree with the map within the gate: a camera at a wrong place agrees by
-    chance on a few surfaces, a tracked one on most, even with something moving through the picture. [ours]"""
-    min_correlation: float = 0.6
-    """Between the colours of the picture and of the map, whatever the exposure: a covered lens, a flash and noise
-    correlate with nothing, where the depth may still agree or be missing. Real frames: 0.92 and more. [ours]"""
-
-    def __post_init__(self) -> None:
-        if self.solver not in ("alignment", "descent"):
-            raise ConfigError(f"tracker.solver is {self.solver!r}; choose alignment or descent")
-        if self.synchronization not in ("none", "stamps", "learnt"):
-            raise ConfigError(f"tracker.synchronization is {self.synchronization!r}; choose none, stamps or learnt")
-        for name in ("max_step", "max_turn"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"tracker.{name} is {getattr(self, name)!r}; it must be above 0")
-        for name in ("view_distance", "view_angle"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"tracker.{name} is {getattr(self, name)!r}; it must be at least 0")
+from tcgsplat.tracking.reference import ReferenceView, reference_view
+from tcgsplat.tracking.settings import TrackerConfig
 
 
 @dataclass(frozen=True)
@@ -141,7 +86,7 @@ class Tracker:
         self._floor = confidence.tracking_floor if confidence.guide_tracking else None
         self._rasterizer = rasterizer
         self._drawing: SubmapView | None = None
-        self._view: ReferenceView | CudaReferenceView | None = None
+        self._view: ReferenceView[Any] | None = None
 
     def track(self, frame: Frame, submap: Submap, guess: Pose) -> Tracked:
         """Pose of `frame` in `submap`, starting from `guess` (`T_map_cam`).
@@ -163,7 +108,7 @@ class Tracker:
             tracked = self._aligned(frame, self._view, guess)
         return tracked
 
-    def _kept_view(self, submap: Submap, camera: Camera, guess: Pose) -> ReferenceView | CudaReferenceView | None:
+    def _kept_view(self, submap: Submap, camera: Camera, guess: Pose) -> ReferenceView[Any] | None:
         """The last one, if it is of this map and from near the guess."""
         view, config = self._view, self._config
         if view is None or self._drawing is None or self._drawing.submap is not submap or view.camera != camera:
@@ -173,14 +118,14 @@ class Tracker:
         near = se3.translation_norm(T_ref_guess) <= config.view_distance and turned <= config.view_angle
         return view if near else None
 
-    def _aligned(self, frame: Frame, view: ReferenceView | CudaReferenceView, guess: Pose) -> Tracked:
+    def _aligned(self, frame: Frame, view: ReferenceView[Any], guess: Pose) -> Tracked:
         """By the solver where the view is, on a GPU or on the CPU."""
-        if isinstance(view, ReferenceView):
-            found = align(frame.cpu(), view, guess, self._config.alignment)
+        if isinstance(view.solid_points, torch.Tensor):
+            images = cuda_alignment.images(view.solid_points.device)
+            there = frame.to(view.solid_points.device)
+            found = cuda_alignment.align(images, there, view, guess, self._config.alignment)
         else:
-            device = view.solid_points.device
-            kernels = cuda_alignment.alignment_kernels(device)
-            found = cuda_alignment.align(kernels, frame.to(device), view, guess, self._config.alignment)
+            found = align(frame.cpu(), view, guess, self._config.alignment)
         tracked = Tracked(
             found.T_map_cam,
             iterations=found.iterations,
@@ -194,7 +139,7 @@ class Tracker:
         )
         return self._believed(guess, tracked)
 
-    def _reference_view(self, submap: Submap, camera: Camera, T_map_ref: Pose) -> ReferenceView | CudaReferenceView:
+    def _reference_view(self, submap: Submap, camera: Camera, T_map_ref: Pose) -> ReferenceView[Any]:
         """The map seen from there: on a GPU if it is drawn there, else on the CPU."""
         if self._drawing is None or self._drawing.submap is not submap:
             self._drawing = SubmapView(submap, self._rasterizer)
@@ -204,10 +149,10 @@ class Tracker:
             weight = torch.ones_like(rendering.confidence)
         else:
             weight = eq.tracking_weight(rendering.confidence, floor=self._floor)
-        if not rendering.alpha.is_cuda:
-            return reference_view(rendering, weight, camera, T_map_ref, self._config.alignment)
-        kernels = cuda_alignment.alignment_kernels(rendering.alpha.device)
-        return cuda_alignment.reference_view(kernels, rendering, weight, camera, T_map_ref, self._config.alignment)
+        seen = (rendering, weight, camera, T_map_ref, self._config.alignment)
+        if rendering.alpha.is_cuda:
+            return reference_view(cuda_alignment.images(rendering.alpha.device), *seen)
+        return reference_view(pyramids, *seen)
 
     def _believed(self, guess: Pose, found: Tracked) -> Tracked:
         """The solver's answer, or the guess and the reason why not."""
