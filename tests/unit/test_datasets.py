@@ -640,18 +640,54 @@ def test_folder_pairs_equal_counts_in_the_order_people_count(tmp_path: Path) -> 
     ]
 
 
-def test_folder_pairs_equal_names_only(tmp_path: Path) -> None:
+def test_folder_pairs_equal_names_only(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """And who lacks a partner leaves a gap in time, or the camera would seem to have moved twice as fast."""
     root = write_folder(tmp_path)
     (root / "depth" / "1.png").unlink()
-    assert [round(float(frame.depth[0, 0]), 3) for frame in open_sequence(root)] == [1.0, 1.2, 1.3]
+    sequence = open_sequence(root)
+    assert [round(float(frame.depth[0, 0]), 3) for frame in sequence] == [1.0, 1.2, 1.3]
+    assert [frame.timestamp for frame in sequence] == pytest.approx([0, 2 / 30, 3 / 30])
+    assert sorted(sequence.ground_truth()) == [0, 1, 2]
+    torch.testing.assert_close(sequence.ground_truth()[1], T_world_cam(2))
+    assert f"images left out in {root}: 1," in caplog.text
+
+
+@pytest.mark.parametrize("without", [("depth/1",), ("color/left_1", "depth/3"), ("color/left_0", "depth/0")])
+def test_folder_pairs_equal_numbers(tmp_path: Path, without: tuple[str, ...]) -> None:
+    root = write_folder(tmp_path, frames=6)
+    for path in the_files(root, "color"):
+        path.rename(path.with_name(f"left_0{path.name}"))
+    for name in without:
+        (root / f"{name.replace('left_', 'left_0')}.png").unlink()
+    missing = {int(name[-1]) for name in without}
+    assert [round(float(frame.depth[0, 0]), 3) for frame in open_sequence(root)] == [
+        round(1 + 0.1 * i, 3) for i in range(6) if i not in missing
+    ]
+
+
+def test_folder_pairs_numbers_that_are_apart_by_one_in_order(tmp_path: Path) -> None:
+    root = write_folder(tmp_path)
+    for number, path in enumerate(the_files(root, "color"), start=1):
+        path.rename(path.with_name(f"left_{number}.png"))
+    assert [round(float(frame.depth[0, 0]), 3) for frame in open_sequence(root)] == [1.0, 1.1, 1.2, 1.3]
+
+
+def test_folder_takes_time_from_names_that_are_time_stamps(tmp_path: Path) -> None:
+    root = write_folder(tmp_path)
+    for kind in ("color", "depth"):
+        for number, path in enumerate(the_files(root, kind)):
+            path.rename(path.with_name(f"1305031102.{100 + 40 * number}.png"))
+    assert [frame.timestamp for frame in open_sequence(root)] == pytest.approx(
+        [1305031102 + 0.1 + 0.04 * i for i in range(4)], abs=1e-6
+    )
 
 
 def test_folder_counts_that_differ_without_common_names(tmp_path: Path) -> None:
     root = write_folder(tmp_path)
     for path in the_files(root, "color"):
-        path.rename(path.with_name(f"left_{path.name}"))
+        path.rename(path.with_name(f"left_{'abcd'[int(path.stem)]}.png"))
     (root / "depth" / "3.png").unlink()
-    with pytest.raises(DatasetError, match=r"4 images in .*color but 3 in .*depth, and no names in common"):
+    with pytest.raises(DatasetError, match=r"4 images in .*color but 3 in .*depth, and no names or numbers in common"):
         open_sequence(root)
 
 

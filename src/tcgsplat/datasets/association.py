@@ -69,8 +69,8 @@ def paired_by_number(colors: Iterable[Path], depths: Iterable[Path], fps: float)
             f"no colour image has a depth image of the same number: {_examples(color_of)}, but {_examples(depth_of)}"
         )
     if lonely := len(color_of.keys() ^ depth_of.keys()):
-        logger.info(
-            "%d images beside %s are left out: colour without depth or the reverse", lonely, color_of[numbers[0]]
+        logger.warning(
+            "images left out beside %s: %d, colour without depth or the reverse", color_of[numbers[0]], lonely
         )
     return tuple(ImagePair(color_of[n], depth_of[n], timestamp=n / fps, number=n) for n in numbers)
 
