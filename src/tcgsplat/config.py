@@ -41,6 +41,10 @@ class SlamConfig:
     seed: int = 0
     """Of the one random generator. [base: TUM and ScanNet] (base: 1 on Replica)"""
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**63:
+            raise ConfigError(f"seed is {self.seed!r}; it must be from 0 to {2**63 - 1}")
+
 
 def settings(config: SlamConfig) -> dict[str, Value]:
     """Every value by its dotted path, in the order of the fields."""

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 
 import torch
 
@@ -50,6 +51,10 @@ with those before it; an error of theirs that is always the same adds up to a hu
 KNOWN = 0.5
 """Share of what a live camera measures that is in the map, below which the map is grown as soon as may be: where half
 is new, the rest is soon out of the picture."""
+
+BEHIND = 3
+"""Finished submaps that a live system keeps waiting; with more, it remembers the next one and compares it with none:
+each holds its pictures while it waits, and a lost camera waits for all of them."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +197,7 @@ class Slam:
         if self._growing is not None and self._growing.done():  # a live system's: else it has been waited for
             self._take_growth()
         update = self._finished_update() if self._adopts_update else None
-        closure = self._finished_closure() if self._adopts_closure else None
+        closure = self._finished_closure(wait=not self._live) if self._adopts_closure else None
         clock.lap("wait")
 
         # Track: the map stands still, only the camera moves (equations 17 to 19).
@@ -280,6 +285,11 @@ class Slam:
         self._keeping.append(self._keeping_thread.submit(self._kept, sealed, None, None))
         self._finished_closure()
         return sealed
+
+    def abandon(self) -> None:
+        """Give up what is queued on the other threads, so that nobody waits for it; nothing can be done after that."""
+        for thread in (self._mapping_thread, self._keeping_thread):
+            thread.shutdown(wait=False, cancel_futures=True)
 
     def rescue(self) -> Submap | None:
         """The last submap kept after a step, or `finish`, has failed because a device had too little memory.
@@ -380,7 +390,10 @@ class Slam:
                 self._store.keep(whole, None)
                 raise
         self._store.keep(whole, checkpoint)
-        return self._closer.closed(sealed.index, edge) if self.config.loop.enabled else Closure(sealed.index)
+        if not self.config.loop.enabled:
+            return Closure(sealed.index)
+        behind = self._live and len(self._keeping) > BEHIND
+        return self._closer.closed(sealed.index, edge, compare=not behind)
 
     def _grown(self, keyframe: Keyframe, submap: Submap, before: Reference) -> Grown:
         """The submap with a keyframe taken in, and seeds where that shows something new.
@@ -436,7 +449,7 @@ class Slam:
     def _adopts_closure(self) -> bool:
         """Whether the closure under way comes into use now."""
         if self._live:
-            return bool(self._keeping) and self._keeping[-1].done()
+            return bool(self._keeping) and self._keeping[0].done()
         return self._since_sealed >= self.config.loop.lag
 
     @property
@@ -455,13 +468,16 @@ class Slam:
         self._refer_to(self.submap)
         return update
 
-    def _finished_closure(self) -> Closure | None:
-        """Wait for the closures that are under way, if any; the submaps stand where the last one says from now on."""
-        closures = [closing.result() for closing in self._keeping]
-        self._keeping.clear()
-        self.closures = (*self.closures, *closures)
+    def _finished_closure(self, *, wait: bool = True) -> Closure | None:
+        """The closures under way, waited for or as far as they are done; the submaps stand where the last one says."""
+        ended = takewhile(lambda closing: wait or closing.done(), tuple(self._keeping))
+        closures = [closing.result() for closing in ended]
         for closure in closures:
+            self._keeping.popleft()
             self.atlas = self.atlas.corrected(closure.T_world_map)
+        if closures:  # what an older one says of all submaps and edges, the newest says too
+            older = (*self.closures[-1:], *closures[:-1])
+            self.closures = (*self.closures[:-1], *(closure.brief() for closure in older), closures[-1])
         return closures[-1] if closures else None
 
     def _refer_to(self, submap: Submap) -> None:

@@ -2,11 +2,13 @@
 
 import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -215,6 +217,33 @@ def test_eval_knows_which_part_of_the_data_was_used(room_folder: Path, tmp_path:
     assert report["ate_rmse"]["value"] < 1.0  # against the wrong frames it would be 5 cm
 
 
+def test_eval_refuses_data_that_the_run_was_not_made_of(
+    run: RunDirectory, room_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    other = Path(shutil.copytree(room_folder, tmp_path / "other"))
+    assert main(["eval", str(run.path), "--sequence", str(other)]) == 0  # a copy is as good
+    text = (other / "camera.toml").read_text()
+    (other / "camera.toml").write_text(text.replace(f"fx = {CAMERA.fx}", "fx = 99.0"))
+    capsys.readouterr()
+    report = (run.path / "report.json").read_bytes()
+    assert main(["eval", str(run.path), "--sequence", str(other)]) == 1
+    said = capsys.readouterr()
+    assert said.out == "" and f"tcgsplat: other is not what {run.path} was made of: frame 0 is " in said.err
+    assert "fx 99, " in said.err and (run.path / "report.json").read_bytes() == report
+
+
+def test_a_full_disk_ends_a_run_with_what_is_saved_and_what_to_do(room_folder: Path, tmp_path: Path):
+    """A limit on the size of a file, here: writing fails as on a full disk."""
+    limited = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (50_000, 50_000))
+    arguments = line("run", room_folder, *SHORT_SUBMAPS, "--out", tmp_path / "run")
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=PATIENCE, preexec_fn=limited)
+    assert done.returncode == 1
+    (said,) = done.stderr.splitlines()
+    file = tmp_path / "run" / "submaps" / "0000.npz"
+    assert said.startswith(f"tcgsplat: {file}: File too large; the run has stopped, 0 submaps sealed before are saved")
+    assert said.endswith("; mend it and go on by --resume")
+
+
 def test_eval_without_the_data_says_so_and_goes_on(run: RunDirectory, capsys: pytest.CaptureFixture[str]):
     about = json.loads((run.path / "run.json").read_text())
     (run.path / "run.json").write_text(json.dumps(about | {"sequence": "/gone/away"}))
@@ -271,6 +300,17 @@ def test_a_run_in_real_time_tells_what_it_dropped(room_folder: Path, tmp_path: P
     assert summary["seconds"] > (FRAMES - 1) / 30
     assert f"; {FRAMES - len(used)} of {FRAMES} frames dropped (" in done.stdout
     assert main(["eval", str(out)]) == 0
+
+    (out / "summary.json").unlink()  # as if it had been killed
+    before = files(out)
+    again = tcgsplat("run", room_folder, "--out", out)
+    assert again.returncode == 1 and "--resume" not in again.stderr and "--overwrite" in again.stderr
+    resumed = tcgsplat("run", room_folder, *work, "--out", out, "--resume")
+    assert resumed.returncode == 1
+    assert resumed.stderr == (
+        f"tcgsplat: the run in {out} was made in real time: nothing resumes it; replace it by --overwrite\n"
+    )
+    assert files(out) == before
 
 
 def test_waiting_for_the_camera_can_be_stopped_and_is_not_work(room_folder: Path, tmp_path: Path):
@@ -403,9 +443,9 @@ def test_without_a_sealed_submap_a_run_begins_anew(
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (["--start", "1"], "Part(start=0, stride=1, limit=None); resume it with the same data"),
-        (["--stride", "2"], "Part(start=0, stride=1, limit=None); resume it with the same data"),
-        (["--limit", "20"], "Part(start=0, stride=1, limit=None); resume it with the same data"),
+        (["--start", "1"], "--start 0, --stride 1, no --limit; resume it with the same"),
+        (["--stride", "2"], "--start 0, --stride 1, no --limit; resume it with the same"),
+        (["--limit", "20"], "--start 0, --stride 1, no --limit; resume it with the same"),
         (
             ["--mapper.iterations", "7", "--seed", "9"],
             "has other settings: mapper.iterations was 10 and is 7; seed was 0 and is 9; resume it with the same ones",
@@ -430,7 +470,7 @@ def test_a_run_of_another_folder_is_not_resumed(
 ):
     other = Path(shutil.copytree(room_folder, tmp_path / "other"))
     assert resumed(other, cut_off(run).path) == 1
-    assert f"the run in {run.path} is of {room_folder}, Part(" in capsys.readouterr().err
+    assert f"the run in {run.path} is of {room_folder}, --start 0" in capsys.readouterr().err
 
 
 def test_the_same_folder_may_be_named_otherwise(run: RunDirectory, room_folder: Path, monkeypatch: pytest.MonkeyPatch):
@@ -500,13 +540,15 @@ def test_ctrl_c_and_on_again(
 
 def test_broken_frames_are_skipped_and_told(room_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     data = Path(shutil.copytree(room_folder, tmp_path / "room"))
-    (data / "rgb" / "0005.png").write_bytes(b"no picture")
+    broken = ["0005", "0008"]  # in the middle, and the last one
+    for name in broken:
+        (data / "rgb" / f"{name}.png").write_bytes(b"no picture")
     assert main(["run", str(data), "--limit", "9", "--out", str(tmp_path / "run")]) == 0
     said = capsys.readouterr()
-    (warning,) = said.err.splitlines()
-    assert warning.startswith("tcgsplat: warning: frame 5 is skipped: ") and "0005.png" in warning
-    assert said.out.startswith("8 frames in ") and " Gaussians; 1 more could not be read: " in said.out
-    assert RunDirectory.open(tmp_path / "run").summary()["frames_unreadable"] == 1
+    for name, warning in zip(broken, said.err.splitlines(), strict=True):
+        assert warning.startswith("tcgsplat: warning: a frame is skipped: ") and f"{name}.png" in warning
+    assert said.out.startswith("7 frames in ") and " Gaussians; 2 more could not be read: " in said.out
+    assert RunDirectory.open(tmp_path / "run").summary()["frames_unreadable"] == 2
 
 
 def test_a_run_goes_to_runs_and_is_not_overwritten_by_accident(

@@ -4,6 +4,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
@@ -16,6 +17,8 @@ from tcgsplat.confidence.state import ConfidenceConfig
 from tcgsplat.config import SlamConfig, with_settings
 from tcgsplat.datasets.sequence import Sequence
 from tcgsplat.geometry import se3
+from tcgsplat.loop.closer import Closure
+from tcgsplat.loop.edge import odometry
 from tcgsplat.loop.settings import LoopConfig
 from tcgsplat.mapping.mapper import Grown, Mapped, Mapper
 from tcgsplat.mapping.optimization import Enough, never
@@ -128,6 +131,21 @@ class TestLag:
             if report.update:
                 assert report.update.frame_index == index
                 assert slam.submap.clock == 1 + index // 4
+
+    def test_a_live_system_takes_the_closures_that_are_done(self, rasterizer: Rasterizer) -> None:
+        """Not only when none is under way any more: where comparing falls behind, that would be never."""
+        slam = Slam(CONFIG, rasterizer, live=True)
+        comparing = [Future[Closure]() for _ in range(3)]
+        slam._keeping.extend(comparing)
+        assert slam.step(SEQUENCE.frame(0)).closure is None
+        for index in range(2):
+            comparing[index].set_result(Closure(index, edges=(odometry(1, 0, se3.identity()),)))
+        taken = slam.step(SEQUENCE.frame(1)).closure
+        assert taken is not None and taken.submap == 1
+        assert [(closure.submap, len(closure.edges)) for closure in slam.closures] == [(0, 0), (1, 1)]
+        comparing[2].set_exception(OSError("the disk is full"))
+        with pytest.raises(OSError, match="full"):
+            slam.step(SEQUENCE.frame(2))
 
     def test_what_is_seeded_is_tracked_against_at_once(self, rasterizer: Rasterizer) -> None:
         slam = Slam(CONFIG, rasterizer, live=True)  # which does not even wait for the first map

@@ -88,7 +88,7 @@ def test_what_is_no_run_or_incomplete_is_told(run: Path, tmp_path: Path, capsys:
     poor = Path(shutil.copytree(run, tmp_path / "poor"))
     (poor / "submaps" / "0001.npz").unlink()
     assert main(["bench", "loops", str(poor)]) == 1
-    assert f"{poor} has lost submap 1 of 4; run again with --overwrite" in capsys.readouterr().err
+    assert f"{poor} has lost submap 1 of 5; run again with --overwrite" in capsys.readouterr().err
     assert main(["bench", "loops", str(run), "--mapper.iterations", "3"]) == 2
     assert "this bench has no settings, but --mapper.iterations was given" in capsys.readouterr().err
 

@@ -153,7 +153,7 @@ def test_every_truncation_is_told(path: Path, generator: torch.Generator):
     whole = path.read_bytes()
     for length in (0, 1, 30, 1000, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:length])
-        with pytest.raises(ArchiveError, match=r"checkpoint\.npz is not a complete archive .*; delete it and run ag"):
+        with pytest.raises(ArchiveError, match=r"checkpoint\.npz is not a complete archive .*; run again with --over"):
             read_checkpoint(path)
 
 
@@ -195,7 +195,7 @@ def test_each_missing_entry_is_named(path: Path, generator: torch.Generator):
     for name in sorted(names - optional):
         path.write_bytes(whole)
         altered(path, **{name: None})
-        with pytest.raises(ArchiveError, match=rf"checkpoint\.npz lacks the entry '{name}'; delete it and run again"):
+        with pytest.raises(ArchiveError, match=rf"checkpoint\.npz lacks the entry '{name}'; run again with"):
             read_checkpoint(path)
 
 

@@ -133,6 +133,8 @@ def test_threads_are_told_to_sleep_before_anything_is_imported(given: dict[str, 
         (["bench", "ablation"], 2, "tcgsplat: give the folders of the sequences, such as"),
         (["bench", "nothing"], 2, "render, track"),
         (["bench", "track"], 2, "FOLDER"),
+        (["bench", "render", "--repeats", "0"], 2, "tcgsplat: --repeats must be at least 1, and --threads from 1 to "),
+        (["run", "nowhere", "--seed", "-1"], 2, "tcgsplat: seed is -1; it must be from 0 to 9223372036854775807\n"),
         (["bench", "track", "nowhere"], 1, "tcgsplat: no folder nowhere; check the path\n"),
         (["bench", "track", "nowhere", "--mapper.iteration", "3"], 2, "there is no setting mapper.iteration; did you"),
         (["bench", "render", "--mapper.iterations", "3"], 2, "this bench has no settings, but --mapper.iterations"),
@@ -240,7 +242,7 @@ def test_many_warnings_of_a_kind_become_a_number(capsys: pytest.CaptureFixture[s
     assert lines[:2] == [f"tcgsplat: warning: frame {i} is skipped: broken" for i in range(2)]
     assert lines[logs.SHOWN :] == [
         "tcgsplat: warning: something else",
-        f"tcgsplat: warning: {40 - logs.SHOWN} more like 'frame %d is skipped: %s'",
+        f"tcgsplat: warning: {40 - logs.SHOWN} more like this, the last: frame 39 is skipped: broken",
     ]
     logger.warning("after the command")
     with logs.on_stderr(debug=True):

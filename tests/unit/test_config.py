@@ -29,7 +29,7 @@ changes = st.fixed_dictionaries(
         "confidence.decay_time": positive,
         "confidence.stability_reduction": st.sampled_from(["mean", "sum"]),
         "confidence.guide_mapping": st.booleans(),
-        "seed": st.integers(),
+        "seed": st.integers(0, 2**63 - 1),
     },
 )
 

@@ -226,6 +226,18 @@ def test_what_is_wrong_with_pictures_is_said_before_they_are_looked_up(
         assert said.err.count("\n") == 1
 
 
+def test_what_is_broken_in_a_folder_is_skipped(world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    for name in ("0.png", "2.png"):
+        shutil.copy(world.color(1), pictures / name)
+    (pictures / "1.png").write_bytes(b"\x89PNG\r\n\x1a\n0")
+    assert main(["localize", str(world.run), str(pictures), "--out", str(tmp_path / "poses.txt")]) == 0
+    said = capsys.readouterr()
+    assert said.err.startswith(f"tcgsplat: warning: a picture is skipped: {pictures / '1.png'} is broken or cut off")
+    assert [float(row.split()[0]) for row in (tmp_path / "poses.txt").read_text().splitlines()[1:]] == [0.0, 2.0]
+
+
 def test_a_folder_that_is_no_run_and_a_run_without_submaps_are_told(
     world: World, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -11,6 +11,7 @@ from analytic_room import CAMERA, Room, pose
 from tcgsplat.confidence.state import ConfidenceConfig, ConfidenceState
 from tcgsplat.geometry import se3
 from tcgsplat.mapping import native_optimization
+from tcgsplat.mapping.brightness import exposures_of
 from tcgsplat.mapping.fields import Fields
 from tcgsplat.mapping.mapper import Mapper
 from tcgsplat.mapping.merging import Merged, merged
@@ -158,6 +159,21 @@ def test_twice_is_the_same(first: Submap, second: Submap, rasterizer: Rasterizer
     assert one.exposures == other.exposures
     for field in fields(one.submap.gaussians):
         assert torch.equal(getattr(one.submap.gaussians, field.name), getattr(other.submap.gaussians, field.name))
+
+
+@pytest.mark.parametrize("noises", [(0.0, 0.0), (0.005, 0.015)])
+@pytest.mark.parametrize("greys", [(0.5, 0.5), (0.0, 0.0), (1.0, 1.0), (0.5, 0.6)])
+def test_a_plain_wall_tells_no_gain(greys: tuple[float, float], noises: tuple[float, float]) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 2, (4000, 3)) * [1, 1, 0]
+    values = [
+        np.concatenate((np.ones((4000, 1)), rng.normal(grey, noise, (4000, 3))), axis=1)
+        for grey, noise in zip(greys, noises, strict=True)
+    ]
+    a, b = exposures_of(Fields([points, points], values, 0.05))
+    shown = [exposure.gain * grey + exposure.offset for exposure, grey in zip((a, b), greys, strict=True)]
+    assert a.gain == pytest.approx(1.0, abs=0.1) and b.gain == pytest.approx(1.0, abs=0.1)
+    assert shown[0] == pytest.approx(shown[1], abs=0.01)
 
 
 def test_brightness_is_brought_together(first: Submap, rasterizer: Rasterizer) -> None:

@@ -282,10 +282,23 @@ def test_closure_moves_submaps_through_the_trajectory_alone(tmp_path: Path, gene
 
 def test_leftovers_of_a_killed_run_are_not_counted(tmp_path: Path, generator: torch.Generator) -> None:
     run = RunDirectory.create(tmp_path / "a", config_toml="", sequence="")
-    for index in (0, 1, 3):
+    for index in range(2):
         run.write_submap(random_submap(index, generator))
     (run.path / "submaps" / ".0002.npz.17.partial").write_bytes(b"half")
     assert RunDirectory.open(run.path).submap_count == 2
+
+
+@pytest.mark.parametrize(("gone", "ended"), [(1, False), (1, True), (2, True)])
+def test_a_submap_that_is_gone_is_missed(tmp_path: Path, generator: torch.Generator, gone: int, ended: bool) -> None:
+    """By those after it; the last one by the summary."""
+    run = RunDirectory.create(tmp_path / "a", config_toml="", sequence="")
+    for index in range(3):
+        run.write_submap(random_submap(index, generator))
+    if ended:
+        run.write_summary({"submaps": 3})
+    (run.path / "submaps" / f"{gone:04d}.npz").unlink()
+    with pytest.raises(ArchiveError, match=rf"a has lost submap {gone} of 3; run again with --overwrite"):
+        _ = RunDirectory.open(run.path).submap_count
 
 
 def test_create_refuses_what_is_there_and_open_refuses_what_is_not(tmp_path: Path) -> None:

@@ -55,6 +55,8 @@ def command(args: Args) -> int:
         open3d()  # its absence is to be met now, not after the merging
     run = RunDirectory.open(args.run)
     out = args.out or run.path
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"--out {out} is a file; give a folder")
     out.mkdir(parents=True, exist_ok=True)
     alone = args.ply or args.trajectory or args.mesh
     if args.ply or args.mesh or not alone:

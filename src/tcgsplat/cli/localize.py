@@ -70,20 +70,22 @@ def command(args: Args) -> int:
     compile_kernels(config, rasterizer)
     known, (_, atlas) = relocalizer(run, rasterizer), run.trajectory()
     stamps, poses, total = [], [], 0
-    with stopping_on_interrupt() as stop:
-        for name, frame in frames:
-            total += 1
-            found = known.relocalized(frame, atlas.T_world_map)
-            if found is None:
-                sys.stdout.write(f"{name}: not found\n")
-            else:
-                T_world_cam = atlas.T_world_map[found.reference.index] @ found.tracked.T_map_cam
-                x, y, z = T_world_cam[:3, 3].tolist()
-                sys.stdout.write(f"{name}: {x:.3f} {y:.3f} {z:.3f} m, in submap {found.reference.index}\n")
-                stamps.append(frame.timestamp)
-                poses.append(T_world_cam)
-            if stop.is_set():
-                break
-    atomic.write_text(out, format_tum(stamps, poses))
+    try:
+        with stopping_on_interrupt() as stop:
+            for name, frame in frames:
+                total += 1
+                found = known.relocalized(frame, atlas.T_world_map)
+                if found is None:
+                    sys.stdout.write(f"{name}: not found\n")
+                else:
+                    T_world_cam = atlas.T_world_map[found.reference.index] @ found.tracked.T_map_cam
+                    x, y, z = T_world_cam[:3, 3].tolist()
+                    stamps.append(frame.timestamp)
+                    poses.append(T_world_cam)
+                    sys.stdout.write(f"{name}: {x:.3f} {y:.3f} {z:.3f} m, in submap {found.reference.index}\n")
+                if stop.is_set():
+                    break
+    finally:  # also where nobody reads the lines any more
+        atomic.write_text(out, format_tum(stamps, poses))
     sys.stdout.write(f"{len(poses)} of {total} pictures found: {out}\n")
     return 130 if stop.is_set() else 0

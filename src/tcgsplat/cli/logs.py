@@ -22,20 +22,22 @@ class Capped(logging.Handler):
     def __init__(self) -> None:
         super().__init__()
         self._seen: Counter[str] = Counter()
+        self._last: dict[str, str] = {}
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the record as one line, unless enough like it have been seen."""
         kind = str(record.msg)
         self._seen[kind] += 1
+        self._last[kind] = record.getMessage()
         if self._seen[kind] <= SHOWN or record.levelno < logging.WARNING:
             label = "warning: " if record.levelno >= logging.WARNING else ""
             sys.stderr.write(f"tcgsplat: {label}{record.getMessage()}\n")
 
     def summarize(self) -> None:
-        """Say how many records of each kind were not shown."""
+        """Say how many records of each kind were not shown, and the last of them."""
         for kind, count in self._seen.items():
             if count > SHOWN:
-                sys.stderr.write(f"tcgsplat: warning: {count - SHOWN} more like {kind!r}\n")
+                sys.stderr.write(f"tcgsplat: warning: {count - SHOWN} more like this, the last: {self._last[kind]}\n")
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Pictures that a user names, as frames of the camera that made a run; and what a finished map knows them by."""
 
+import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import torch
 from tcgsplat.cli.progress import counting
 from tcgsplat.config import from_toml
 from tcgsplat.datasets import open_sequence
-from tcgsplat.datasets.images import SUFFIXES, image_files, read_color
+from tcgsplat.datasets.images import SUFFIXES, UnreadableImageError, image_files, read_color
 from tcgsplat.datasets.opening import LAYOUTS
 from tcgsplat.errors import ArchiveError, DatasetError
 from tcgsplat.geometry.camera import Camera
@@ -17,6 +18,8 @@ from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.frame import Frame
 from tcgsplat.storage.run_directory import RunDirectory
 from tcgsplat.tensors import Image
+
+logger = logging.getLogger(__name__)
 
 _KINDS = ", ".join(sorted(SUFFIXES))
 
@@ -37,7 +40,8 @@ def frames_of(
 
     Raises:
         ArchiveError: if the run has no submap yet.
-        DatasetError: if there are no pictures, one cannot be read, or its size is not that of the run's pictures.
+        DatasetError: if there are no pictures, or the size of one is not that of the run's; or one that was named
+            cannot be read; what cannot be read of a folder is left out with a warning.
     """
     if not run.submap_count:
         raise ArchiveError(f"{run.path} has no finished submap to find anything in; let the run go on for longer")
@@ -53,10 +57,16 @@ def frames_of(
     chosen = files[start::stride][:limit]
     if not chosen:
         raise DatasetError(f"there are {len(files)} pictures, counted from 0, and --start is {start}; begin earlier")
-    camera = run.load_submap(0).keyframes[0].frame.camera
-    for file in chosen:
-        _read(file, camera)
-    return ((str(file), _frame(number, file, camera)) for number, file in enumerate(chosen))
+    camera, whole = run.load_submap(0).keyframes[0].frame.camera, list[tuple[int, Path]]()
+    for number, file in enumerate(chosen):
+        try:
+            _read(file, camera)
+            whole.append((number, file))
+        except UnreadableImageError as error:
+            if file in images:
+                raise
+            logger.warning("a picture is skipped: %s", error)
+    return ((str(file), _frame(number, file, camera)) for number, file in whole)
 
 
 def relocalizer(run: RunDirectory, rasterizer: Rasterizer) -> Relocalizer:

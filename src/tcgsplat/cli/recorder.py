@@ -46,6 +46,11 @@ class Part:
     stride: int = 1
     limit: int | None = None
 
+    def __str__(self) -> str:
+        """As the flags that ask for it."""
+        limit = "no --limit" if self.limit is None else f"--limit {self.limit}"
+        return f"--start {self.start}, --stride {self.stride}, {limit}"
+
     def open(self, folder: Path | str) -> Sequence:
         """The part of the sequence in a folder.
 
@@ -78,11 +83,13 @@ def resume(path: Path, config: SlamConfig, folder: Path, part: Part, *, backend:
     if run.summary() and not run.summary().get("interrupted"):
         raise ArchiveError(f"the run in {path} has ended, and there is nothing to resume; use --overwrite to repeat it")
     if Path(run.sequence) != folder.expanduser().resolve() or Part.of(run) != part:
-        raise ArchiveError(f"the run in {path} is of {run.sequence}, {Part.of(run)}; resume it with the same data")
+        raise ArchiveError(f"the run in {path} is of {run.sequence}, {Part.of(run)}; resume it with the same")
     now, then = settings(config), settings(from_toml(run.config_toml))
     other = [f"{name} was {then[name]} and is {now[name]}" for name in now if now[name] != then[name]]
     if other:
         raise ArchiveError(f"the run in {path} has other settings: {'; '.join(other)}; resume it with the same ones")
+    if (run.request or {}).get("realtime"):
+        raise ArchiveError(f"the run in {path} was made in real time: nothing resumes it; replace it by --overwrite")
     if backend != (drawn := (run.request or {}).get("backend") or backend):
         raise ArchiveError(
             f"the run in {path} was drawn by {drawn}, and {backend} has other bits; add --backend {drawn}"
@@ -94,7 +101,14 @@ def resume(path: Path, config: SlamConfig, folder: Path, part: Part, *, backend:
 
 
 def begin(
-    path: Path, config: SlamConfig, folder: Path, part: Part, *, overwrite: bool, backend: str = ""
+    path: Path,
+    config: SlamConfig,
+    folder: Path,
+    part: Part,
+    *,
+    overwrite: bool,
+    backend: str = "",
+    realtime: bool = False,
 ) -> RunDirectory:
     """A new run directory that knows its settings and its data, and the rasterizer if that is told.
 
@@ -104,13 +118,17 @@ def begin(
     if not is_free(path):
         if not overwrite:
             unfinished = (path / "run.json").exists() and not (path / "summary.json").exists()
-            goes_on = "go on with the unfinished run in it by --resume, " if unfinished else ""
+            resumable = unfinished and not (RunDirectory.open(path).request or {}).get("realtime")
+            goes_on = "go on with the unfinished run in it by --resume, " if resumable else ""
             raise ArchiveError(
                 f"{path} exists; {goes_on}choose another folder by --out, or replace the run by --overwrite"
             )
-        shutil.rmtree(RunDirectory.open(path).path)  # `open` refuses a folder that holds no run
+        old = path.with_name(f".{path.name}.replaced")  # a kill while it is deleted leaves no half of a run behind
+        shutil.rmtree(old, ignore_errors=True)
+        shutil.rmtree(RunDirectory.open(path).path.rename(old))  # `open` refuses a folder that holds no run
     data, command = str(folder.expanduser().resolve()), shlex.join(["tcgsplat", *sys.argv[1:]])
-    request = json.dumps({"command": command, "backend": backend, **asdict(part)}, indent=2) + "\n"
+    about = {"command": command, "backend": backend, "realtime": realtime, **asdict(part)}
+    request = json.dumps(about, indent=2) + "\n"
     return RunDirectory.create(path, config_toml=to_toml(config), sequence=data, request=request)
 
 
@@ -161,8 +179,16 @@ def recorded(
         ):
             summary = record(slam, arrivals, run, progress.observe, stop.is_set, watch)
     except KeyboardInterrupt as interrupt:
+        slam.abandon()
         saved = f"{run.submap_count} submaps sealed before are saved"
         raise KeyboardInterrupt(f"stopped at once; {saved}: {run.path}") from interrupt
+    except OSError as error:  # a full disk, above all
+        saved = f"{run.submap_count} submaps sealed before are saved"
+        goes_on = "replace the run by --overwrite" if realtime else "go on by --resume"
+        what = f"{error.filename}: {error.strerror}"
+        raise ArchiveError(f"{what}; the run has stopped, {saved}: {run.path}; mend it and {goes_on}") from error
+    if not summary.interrupted:
+        summary = replace(summary, frames_unreadable=len(sequence) - summary.frames - summary.frames_dropped)
     summary = replace(
         summary,
         resumed_at=None if checkpoint is None else checkpoint.frame_index,

@@ -79,7 +79,8 @@ def command(args: Args) -> int:
         if args.resume and (out / "run.json").exists():
             run = resume(out, config, args.folder, part, backend=rasterizer.name)
         else:
-            run = begin(out, config, args.folder, part, overwrite=args.overwrite, backend=rasterizer.name)
+            about = (out, config, args.folder, part)
+            run = begin(*about, overwrite=args.overwrite, backend=rasterizer.name, realtime=args.realtime)
     summary = recorded(sequence, config, rasterizer, run, args.preset, realtime=args.realtime, waited=waited.seconds)
     if summary.interrupted:
         sys.stderr.write(f"tcgsplat: stopped; saved {summary}: {run.path}\n")

@@ -9,6 +9,7 @@ from tcgsplat.cli.recorder import Part
 from tcgsplat.cli.usage import UsageError
 from tcgsplat.datasets import Sequence
 from tcgsplat.datasets.truth import Truth
+from tcgsplat.errors import DatasetError
 from tcgsplat.evaluation import canvas
 from tcgsplat.evaluation.figures import contact_sheet_of, trajectory_plot_of
 from tcgsplat.evaluation.free import free_rows
@@ -18,6 +19,7 @@ from tcgsplat.evaluation.report import Report, evaluate
 from tcgsplat.evaluation.surface import paired_poses, surface_of_run, true_mesh_path
 from tcgsplat.mapping.merging import Merged
 from tcgsplat.render.protocol import Rasterizer
+from tcgsplat.scene.frame import Frame
 from tcgsplat.storage.mesh_ply import read_mesh
 from tcgsplat.storage.run_directory import RunDirectory
 from tcgsplat.storage.world_map import world_map
@@ -122,16 +124,40 @@ def _with_surface(
 
 
 def data_of(run: RunDirectory | None, given: Path | None) -> Sequence | None:
-    """The part of the data that the run used, or None if it is not at hand."""
+    """The part of the data that the run used, or None if it is not at hand.
+
+    Raises:
+        DatasetError: if what is there cannot be read, or is not what the run was made of.
+    """
     part = Part.of(run) if run else Part()
-    if given is not None:
-        return part.open(given)
     if run is None:
-        return None
+        return None if given is None else part.open(given)
+    if given is not None:
+        return _checked(part.open(given), run)
     if not Path(run.sequence).is_dir():
         logger.warning(
             "%s, the data of the run, is not there: nothing to compare with but keyframes; give --sequence",
             run.sequence,
         )
         return None
-    return part.open(run.sequence)
+    return _checked(part.open(run.sequence), run)
+
+
+def _checked(sequence: Sequence, run: RunDirectory) -> Sequence:
+    """The sequence, if the run's first keyframe is of it."""
+    if not run.submap_count:
+        return sequence
+    ours = run.open_submaps()[0].keyframes[0].frame
+    theirs = sequence.frame(ours.index) if ours.index < len(sequence) else None
+    if theirs is None or (theirs.camera, theirs.timestamp) != (ours.camera, ours.timestamp):
+        other = "there is no such frame" if theirs is None else f"there it is {_told(theirs)}"
+        raise DatasetError(
+            f"{sequence.name} is not what {run.path} was made of: frame {ours.index} is {_told(ours)}, and {other}; "
+            "give the same recording by --sequence"
+        )
+    return sequence
+
+
+def _told(frame: Frame) -> str:
+    camera = frame.camera
+    return f"{camera.width}x{camera.height}, fx {camera.fx:g}, at {frame.timestamp:.3f} s"

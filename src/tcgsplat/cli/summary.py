@@ -65,7 +65,7 @@ class Summary:
     frames_total: int = 0
     """Captured until the run ended: used or dropped. Images that cannot be read are not among them."""
     frames_unreadable: int = 0
-    """Before the last one that was used, skipped because an image could not be read."""
+    """Skipped because an image could not be read; of an interrupted run, before the last one that was used."""
     ms_late_median: float | None = None
     """From a frame's capture to the end of its step, the first one included; None if not in real time."""
     ms_late_p95: float | None = None

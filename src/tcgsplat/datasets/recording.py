@@ -84,15 +84,15 @@ class Recording:
         """Frames in order, decoded ahead in one thread; those that cannot be read are skipped with a warning."""
         with ThreadPoolExecutor(max_workers=1, thread_name_prefix="read-ahead") as reader:
             indices = iter(range(first, len(self)))
-            ahead = deque((i, reader.submit(self.frame, i)) for i in islice(indices, READ_AHEAD))
+            ahead = deque(reader.submit(self.frame, i) for i in islice(indices, READ_AHEAD))
             while ahead:
-                index, reading = ahead.popleft()
+                reading = ahead.popleft()
                 try:
                     frame = reading.result()
                 except DatasetError as error:
-                    logger.warning("frame %d is skipped: %s", index, error)
+                    logger.warning("a frame is skipped: %s", error)
                     frame = None
-                ahead.extend((i, reader.submit(self.frame, i)) for i in islice(indices, 1))
+                ahead.extend(reader.submit(self.frame, i) for i in islice(indices, 1))
                 if frame is not None:
                     yield frame
 

@@ -7,7 +7,7 @@ only when it is to be registered.
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Final
 
@@ -60,6 +60,10 @@ class Closure:
     seconds: float = 0.0
     """Wall time."""
 
+    def brief(self) -> "Closure":
+        """Without what grows with the run."""
+        return replace(self, T_world_map=(), edges=(), rejected=())
+
 
 class LoopCloser:
     """Keeps what is known of finished submaps: their places, and the edges between them."""
@@ -88,12 +92,13 @@ class LoopCloser:
         for index in range(len(T_world_map) - 1):
             self._relocalizer.remember(self._load(index))
 
-    def closed(self, index: int, following: Edge | None) -> Closure:
+    def closed(self, index: int, following: Edge | None, *, compare: bool = True) -> Closure:
         """Compare a finished submap, which can be read back by now, with those before it; once each, in their order.
 
         Args:
             index: Of the submap.
             following: From the submap that has begun since to the one where its first frame was tracked.
+            compare: If not, the submap is remembered, so that later ones are compared with it, and no more.
         """
         started = time.perf_counter()
         if following is not None:
@@ -102,7 +107,8 @@ class LoopCloser:
             self.T_world_map = (*self.T_world_map, se3.orthonormalized(T_world_map))
         submap = self._load(index)
         self._relocalizer.remember(submap)
-        candidates, known = self._relocalizer.places.candidates(index, self.T_world_map, self._config), measured(submap)
+        places, known = self._relocalizer.places, measured(submap)
+        candidates = places.candidates(index, self.T_world_map, self._config) if compare else []
         registrations = tuple(self._registered(known, candidate) for candidate in candidates)
         loops = tuple(
             Edge(pair.source, pair.target, pair.T_target_source, pair.information, loop=True)

@@ -186,4 +186,5 @@ def _fused(estimates: Sequence[Estimate]) -> tuple[Pose, Doubles]:
             np.zeros(6),
         )
         T = T @ se3.exp(torch.from_numpy(np.linalg.solve(information + 1e-3 * np.eye(6), pull)))
-    return se3.orthonormalized(T), np.asarray(np.linalg.inv(covariance(information)))
+    inverse = np.asarray(np.linalg.inv(covariance(information)))
+    return se3.orthonormalized(T), 0.5 * (inverse + inverse.T)

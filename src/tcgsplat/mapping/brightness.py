@@ -12,6 +12,9 @@ _FEWEST = 50
 """Corners that two submaps must share."""
 _PER_CELL = 8.0
 """Corners that one surface patch has spread to: they do not vote one by one."""
+_FLAT = 5e-4
+"""Variance of colours that a gain of 1 is worth: two submaps may share nothing but a plain wall, and the ratio of what
+noise (0.01 to 0.02) does to either tells no gain."""
 _ROUNDS = 20
 _ERROR = 0.02
 """Of a pair's relative brightness, however many corners agree on it: surfaces look different from elsewhere."""
@@ -75,11 +78,13 @@ def _relative(fields: Fields, a: int, b: int) -> tuple[float, float, float] | No
     trusted = weight
     for _ in range(_ROUNDS):
         middle_x, middle_y = np.average(x, weights=trusted), np.average(y, weights=trusted)
-        gain = np.sqrt(((y - middle_y) ** 2 * trusted).sum() / max(((x - middle_x) ** 2 * trusted).sum(), 1e-12))
+        variance_x, variance_y = (
+            np.average((z - middle) ** 2, weights=trusted) + _FLAT for z, middle in ((x, middle_x), (y, middle_y))
+        )
+        gain = np.sqrt(variance_y / variance_x)
         residual = np.abs(y - middle_y - gain * (x - middle_x))
         sigma = max(1.4826 * float(np.median(residual)), 1e-4)
         trusted = weight / (1.0 + (residual / (2.0 * sigma)) ** 2)
-    contrast = np.sqrt(np.average((x - middle_x) ** 2, weights=trusted))
     independent = max(trusted.sum() / weight.mean() / 3.0 / _PER_CELL, 1.0)
-    error = sigma / max(float(contrast), 1e-6) / np.sqrt(independent)
+    error = sigma / np.sqrt(variance_x * independent)
     return float(gain), float(middle_y - gain * middle_x), float(np.hypot(error, _ERROR))

@@ -77,9 +77,9 @@ def format_tum(
     Enough digits that reading it back gives the same numbers.
     """
     lines = ["# timestamp tx ty tz qx qy qz qw"]
-    for stamp, T in zip(timestamps, T_world_cam, strict=True):
-        w, x, y, z = quaternion.from_matrix(T[:3, :3]).tolist()
-        tx, ty, tz = T[:3, 3].tolist()
+    T = torch.stack(T_world_cam) if T_world_cam else torch.empty(0, 4, 4)
+    turns, places = quaternion.from_matrix(T[:, :3, :3]).tolist(), T[:, :3, 3].tolist()
+    for stamp, (w, x, y, z), (tx, ty, tz) in zip(timestamps, turns, places, strict=True):
         lines.append(f"{float(stamp)!r} " + " ".join(f"{value:.17g}" for value in (tx, ty, tz, x, y, z, w)))
     return "\n".join(lines) + "\n"
 

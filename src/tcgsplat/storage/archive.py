@@ -73,7 +73,8 @@ def read_arrays(path: Path, kind: str, names: Collection[str] | None = None) -> 
     except FileNotFoundError as error:
         raise ArchiveError(f"no file {path}; give a run directory that holds it") from error
     except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        raise ArchiveError(f"{path} is not a complete archive ({error}); delete it and run again") from error
+        again = "`tcgsplat refine` makes it anew" if kind == "map" else "run again with --overwrite"
+        raise ArchiveError(f"{path} is not a complete archive ({error}); {again}") from error
     found = str(arrays.get("kind", "something else"))
     if found != kind:
         raise ArchiveError(f"{path} holds {found}, not a {kind}; give the file or folder that a run of tcgsplat wrote")
@@ -191,7 +192,7 @@ def _complete(path: Path) -> Iterator[None]:
     try:
         yield
     except KeyError as error:
-        raise ArchiveError(f"{path} lacks the entry {error}; delete it and run again") from error
+        raise ArchiveError(f"{path} lacks the entry {error}; run again with --overwrite") from error
 
 
 def _array(tensor: Tensor) -> Array:
@@ -244,5 +245,5 @@ def _encode_png(image: Array) -> Png:
 def _decode_png(png: Png) -> Array:
     image = cv2.imdecode(png, cv2.IMREAD_UNCHANGED)
     if image is None:
-        raise ArchiveError("a keyframe image in the archive is not a PNG; delete the archive and run again")
+        raise ArchiveError("a keyframe image in the archive is not a PNG; run again with --overwrite")
     return np.asarray(image)

@@ -28,6 +28,8 @@ def writing(path: Path) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())  # or a power cut could leave the new name on an empty file
         partial.replace(path)
+    except OSError as error:  # of a full disk, for instance, which does not tell the file
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         partial.unlink(missing_ok=True)
 

@@ -113,4 +113,4 @@ def read_checkpoint(path: Path) -> Checkpoint:
             generator=torch.from_numpy(arrays["generator"]),
         )
     except KeyError as error:
-        raise ArchiveError(f"{path} lacks the entry {error}; delete it and run again") from error
+        raise ArchiveError(f"{path} lacks the entry {error}; run again with --overwrite") from error

@@ -17,7 +17,7 @@ moves submaps by `trajectory.npz` alone, and `refine` leaves them as they are.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
@@ -109,10 +109,15 @@ class RunDirectory:
 
     @property
     def submap_count(self) -> int:
-        """Sealed submaps on disk, counted from 0 up to the first gap."""
-        count = 0
-        while self._submap_path(count).is_file():
-            count += 1
+        """Sealed submaps on disk.
+
+        Raises:
+            ArchiveError: if one is gone: a later one is there, or a run that has ended says that there were more.
+        """
+        there = {int(path.stem) for path in (self.path / "submaps").glob("[0-9]*.npz")}
+        ended = self.summary().get("submaps", 0)
+        count = max(max(there, default=-1) + 1, ended if isinstance(ended, int) else 0)
+        self._lacks_none(there, count)
         return count
 
     def write_submap(self, submap: Submap) -> None:
@@ -137,10 +142,7 @@ class RunDirectory:
         if not path.exists():
             return None
         found = read_checkpoint(path)
-        if self.submap_count < found.sealed:
-            raise ArchiveError(
-                f"{self.path} has lost submap {self.submap_count} of {found.sealed}; run again with --overwrite"
-            )
+        self._lacks_none(range(self.submap_count), found.sealed)
         return found
 
     @property
@@ -154,7 +156,7 @@ class RunDirectory:
         Raises:
             ArchiveError: if its file is missing, damaged, or of another version.
         """
-        return _standing(archive.read_submap(self._submap_path(index)), self.trajectory()[1])
+        return _standing(archive.read_submap(self._submap_path(index)), self._atlas())
 
     def open_submaps(self) -> tuple[Submap, ...]:
         """All sealed submaps, standing where the last written trajectory has them; keyframes are read when asked for.
@@ -162,7 +164,7 @@ class RunDirectory:
         Raises:
             ArchiveError: as `load_submap`; also when a keyframe is asked for.
         """
-        _, atlas = self.trajectory()
+        atlas = self._atlas()
         paths = (self._submap_path(index) for index in range(self.submap_count))
         return tuple(_standing(archive.open_submap(path), atlas) for path in paths)
 
@@ -212,6 +214,15 @@ class RunDirectory:
             return Trajectory(), Atlas()
         return trajectory_of(archive.read_arrays(path, "trajectory"))
 
+    def _atlas(self) -> Atlas:
+        """The submap poses alone, whatever the number of frames."""
+        path = self.path / "trajectory.npz"
+        if not path.exists():
+            return Atlas()
+        return Atlas(
+            tuple(map(torch.from_numpy, archive.read_arrays(path, "trajectory", ("T_world_map",))["T_world_map"]))
+        )
+
     def write_summary(self, summary: Mapping[str, object]) -> None:
         """Say how the run went, once it has ended.
 
@@ -229,6 +240,12 @@ class RunDirectory:
         """
         path = self.path / "summary.json"
         return _read_json(path, f"cannot read {path}") if path.exists() else {}
+
+    def _lacks_none(self, there: Collection[int], count: int) -> None:
+        """There are so many submaps, or a complaint."""
+        for index in range(count):
+            if index not in there:
+                raise ArchiveError(f"{self.path} has lost submap {index} of {count}; run again with --overwrite")
 
     def _submap_path(self, index: int) -> Path:
         return self.path / "submaps" / f"{index:04d}.npz"

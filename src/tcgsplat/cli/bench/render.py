@@ -13,6 +13,7 @@ from tcgsplat.cli.bench import Render
 from tcgsplat.cli.bench.iteration import Iteration
 from tcgsplat.cli.bench.limit import Machine, Needs, floors
 from tcgsplat.cli.summary import machine
+from tcgsplat.cli.usage import UsageError
 from tcgsplat.geometry.camera import Camera
 from tcgsplat.render.conventions import MAX_OPACITY
 from tcgsplat.render.numba_cpu.passes import Drawn, Passes
@@ -104,7 +105,12 @@ class Result:
 
 def command(args: Render) -> int:
     """Print two tables, and write the file that was asked for."""
-    able = Machine.measured(args.threads or available_cores())
+    cores = available_cores()
+    if args.repeats < 1 or not 1 <= (args.threads or 1) <= cores:
+        raise UsageError(f"--repeats must be at least 1, and --threads from 1 to {cores}, as many as there are cores")
+    if args.json is not None and not args.json.parent.is_dir():
+        raise UsageError(f"--json {args.json} cannot be written: give a file in a folder that is there")
+    able = Machine.measured(args.threads or cores)
     results: dict[Size, Result] = {}
     for size in SIZES:
         result = results[size] = measured(size, args.repeats, able)
