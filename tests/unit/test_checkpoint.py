@@ -10,7 +10,7 @@ import torch
 
 from tcgsplat.errors import ArchiveError
 from tcgsplat.geometry import se3
-from tcgsplat.loop.edge import Edge
+from tcgsplat.loop.edge import Edge, Verdict
 from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.submap import Submap
@@ -42,10 +42,11 @@ def random_row(index: int, generator: torch.Generator) -> TrackedPose:
 
 def random_edge(source: int, target: int, generator: torch.Generator, *, loop: bool) -> Edge:
     spread = torch.randn(6, 6, dtype=torch.float64, generator=generator)
-    return Edge(source, target, random_pose(generator), (spread @ spread.T).numpy(), loop)
+    verdict: Verdict = ("", "believed", "rejected")[source // 3 % 3] if loop else ""
+    return Edge(source, target, random_pose(generator), (spread @ spread.T).numpy(), loop, verdict)
 
 
-def random_checkpoint(generator: torch.Generator, *, sealed: int = 3, edges: int = 4, rows: int = 12) -> Checkpoint:
+def random_checkpoint(generator: torch.Generator, *, sealed: int = 3, edges: int = 9, rows: int = 12) -> Checkpoint:
     def vector() -> torch.Tensor:
         return torch.randn(6, dtype=torch.float64, generator=generator)
 

@@ -31,10 +31,15 @@ logger = logging.getLogger(__name__)
 LATE: Final = (
     "tcgsplat.loop.pose_graph",  # and with it gtsam
     "scipy.sparse.csgraph",
+    "scipy.sparse.linalg",
     "scipy.spatial.transform",
     "scipy.special",
 )
 """What is imported only when a submap is first compared or a loop closed, so that a run begins sooner."""
+
+JUDGED: Final = 60
+"""Loop edges, the newest, that are judged anew whenever a loop is closed; what was said of older ones stays. A wrong
+one contradicts those of its own place, which come in the minutes around it, and judging takes the cube of the time."""
 
 
 def import_late_modules() -> None:
@@ -126,8 +131,15 @@ class LoopCloser:
         """Which edges are rejected by now, and, if the submaps are to move, where they stand."""
         from tcgsplat.loop.pose_graph import solved  # noqa: PLC0415 (gtsam takes a twentieth of the start-up)
 
-        solution = solved(self.T_world_map, self.edges)
-        self.rejected = tuple(self.edges[place] for place in solution.rejected)
+        considered = [edge for edge in self.edges if edge.verdict != "rejected"]
+        solution = solved(self.T_world_map, considered)
+        doubted = {considered[place] for place in solution.rejected}
+        settled = {*[edge for edge in self.edges if edge.judged][:-JUDGED]}
+        self.edges = tuple(
+            replace(edge, verdict="rejected" if edge in doubted else "believed") if edge in settled else edge
+            for edge in self.edges
+        )
+        self.rejected = tuple(edge for edge in self.edges if edge.verdict == "rejected" or edge in doubted)
         if move:
             self.T_world_map = solution.T_world_map
 

@@ -1,12 +1,15 @@
 """How submaps stand to each other: the edges of the pose graph."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
 
 from tcgsplat.geometry import se3
 from tcgsplat.tensors import Pose
+
+Verdict = Literal["", "believed", "rejected"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,6 +23,13 @@ class Edge:
     """Inverse covariance of xi, translation first (metres, radians), where T_target_source exp(xi) is the truth."""
     loop: bool
     """It may be wrong, as an edge of the odometry may not."""
+    verdict: Verdict = ""
+    """Of a loop edge: whether it is believed for good; empty as long as each solution judges it anew."""
+
+    @property
+    def judged(self) -> bool:
+        """Whether a solution of the pose graph says if it is believed."""
+        return self.loop and not self.verdict
 
 
 def odometry(source: int, target: int, T_target_source: Pose) -> Edge:

@@ -60,7 +60,7 @@ class Solution:
 
 
 def solved(T_world_map: Sequence[Pose], edges: Sequence[Edge], *, inlier_probability: float = 0.99) -> Solution:
-    """Poses that fit the odometry and those loop edges that deserve belief.
+    """Poses that fit the odometry, the loop edges believed for good, and those of the others that deserve belief.
 
     The lowest node of whatever edges join stays where it is given, bit by bit; so do a node without edges, and every
     node if there is no loop edge, if the poses given are already the best, or if the optimiser fails, which rejects all
@@ -72,7 +72,8 @@ def solved(T_world_map: Sequence[Pose], edges: Sequence[Edge], *, inlier_probabi
 
     Args:
         T_world_map: One float64 pose a node; where the search starts.
-        edges: Between nodes, which they name by their place in `T_world_map`.
+        edges: Between nodes, which they name by their place in `T_world_map`; none that is rejected for good. The time
+            grows with the cube of the number of those that are to be judged.
         inlier_probability: Share of right loop edges that pass when they are judged, in (0, 1).
 
     Raises:
@@ -82,7 +83,7 @@ def solved(T_world_map: Sequence[Pose], edges: Sequence[Edge], *, inlier_probabi
     for place, edge in enumerate(edges):
         _check(place, edge, len(T_world_map))
     order = sorted(range(len(edges)), key=lambda place: _name(edges[place]))
-    loops = [place for place in order if edges[place].loop]
+    loops = [place for place in order if edges[place].judged]
     graph = _Graph.of(T_world_map, [edges[place] for place in order])
     limit = 2.0 * float(
         scipy.special.gammaincinv(3.0, inlier_probability)
@@ -149,7 +150,7 @@ class _Graph:
         for node, pose in enumerate(given):
             start.insert(node, pose)
         whole = _lowest(len(given), edges)
-        pieces = _lowest(len(given), [edge for edge in edges if not edge.loop])
+        pieces = _lowest(len(given), [edge for edge in edges if not edge.judged])
         anchor = gtsam.noiseModel.Isotropic.Sigma(6, _ANCHOR)
         anchors: list[gtsam.NonlinearFactor] = [
             gtsam.PriorFactorPose3(node, given[node], anchor) for node in sorted(set(whole))
@@ -158,7 +159,7 @@ class _Graph:
         for piece in sorted(set(pieces) - set(whole)):
             root = whole[piece]
             anchors.append(gtsam.BetweenFactorPose3(root, piece, given[root].between(given[piece]), leash))
-        factors = [(_factor(edge), edge.loop) for edge in edges]
+        factors = [(_factor(edge), edge.judged) for edge in edges]
         return cls(
             start=start,
             held=frozenset(whole),
@@ -200,9 +201,9 @@ class _Graph:
         m = 6 * len(self.loops)
         A, b = jacobian[:-m, :-1], jacobian[:-m, [-1]].toarray()
         J, r = jacobian[-m:, :-1], -jacobian[-m:, [-1]].toarray()
-        P = _inverse(torch.from_numpy((A.T @ A).toarray())).numpy()
-        r = r + J @ (P @ (A.T @ b))
-        return torch.from_numpy(np.block([[np.eye(m) + J @ (J @ P).T, r], [r.T, np.zeros((1, 1))]]))
+        P = scipy.sparse.linalg.splu((A.T @ A).tocsc())  # whose inverse is the covariance
+        r, expected = r + J @ P.solve(A.T @ b), J @ P.solve(J.T.toarray())
+        return torch.from_numpy(np.block([[np.eye(m) + 0.5 * (expected + expected.T), r], [r.T, np.zeros((1, 1))]]))
 
     def moved(self, T_world_map: Sequence[Pose], state: _State) -> tuple[Pose, ...]:
         """The poses of a state, but for those held, which come back as they were given."""

@@ -5,7 +5,7 @@ At that moment the active submap is empty and no update is under way, so little 
 
 from dataclasses import astuple, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from tcgsplat.errors import ArchiveError
-from tcgsplat.loop.edge import Edge
+from tcgsplat.loop.edge import Edge, Verdict
 from tcgsplat.scene.atlas import Atlas
 from tcgsplat.scene.exposure import Exposure
 from tcgsplat.scene.trajectory import Trajectory
@@ -54,6 +54,14 @@ class Checkpoint:
     exact tells the path so far, and nobody can go on from it."""
 
 
+_KINDS: Final[tuple[tuple[bool, Verdict], ...]] = ((False, ""), (True, ""), (True, "believed"), (True, "rejected"))
+"""Whether an edge closes a loop, and what was said of it."""
+
+
+def _kind(edge: Edge) -> int:
+    return _KINDS.index((edge.loop, edge.verdict))
+
+
 def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     """Put a checkpoint on disk, all of it or nothing."""
     c, motion = checkpoint, checkpoint.motion
@@ -66,7 +74,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
             "T_map_reference": c.T_map_reference.numpy(),
             "reference_exposure": np.array(astuple(c.exposure)),
             "generator": c.generator.numpy(),
-            "edge": np.array([(e.source, e.target, e.loop) for e in c.edges], np.int64).reshape(-1, 3),
+            "edge": np.array([(e.source, e.target, _kind(e)) for e in c.edges], np.int64).reshape(-1, 3),
             "edge_pose": np.array([e.T_target_source.numpy() for e in c.edges]).reshape(-1, 4, 4),
             "edge_information": np.array([e.information for e in c.edges]).reshape(-1, 6, 6),
             "motion_pose": motion.T_map_cam.numpy(),
@@ -97,7 +105,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
             sealed=sealed,
             trajectory=trajectory,
             atlas=atlas,
-            edges=tuple(Edge(s, t, torch.from_numpy(T), info, bool(loop)) for (s, t, loop), T, info in edges),
+            edges=tuple(Edge(s, t, torch.from_numpy(T), info, *_KINDS[kind]) for (s, t, kind), T, info in edges),
             motion=ConstantVelocity(
                 torch.from_numpy(arrays["motion_pose"]),
                 None if np.isnan(timestamp) else timestamp,
