@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
@@ -17,6 +18,8 @@ from patterned_room import PatternedRoom
 
 from tcgsplat.config import SlamConfig
 from tcgsplat.geometry import se3
+from tcgsplat.loop import relocalization
+from tcgsplat.loop.features import Features, features
 from tcgsplat.loop.settings import LoopConfig
 from tcgsplat.mapping.schedule import ScheduleConfig
 from tcgsplat.mapping.seeding import SeedingConfig
@@ -358,6 +361,23 @@ class TestLost:
         assert not any(report.found for report in result.reports)
         assert [row.frame_index for row in result.slam.trajectory.rows if row.lost] == list(range(40, len(frames)))
         assert not any(row.mapped for row in result.slam.trajectory.rows[40:])
+
+    def test_pictures_of_the_submap_that_grows_are_looked_at_once(
+        self, rasterizer: Rasterizer, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        asked: Counter[int] = Counter()
+
+        def counted(frame: Frame) -> Features:
+            asked[frame.index] += 1
+            return features(frame)
+
+        monkeypatch.setattr(relocalization, "features", counted)
+        frames, _ = carried(BACK, room=PatternedRoom(seed=7))
+        result = run(frames, rasterizer)
+        lost = [row.frame_index for row in result.slam.trajectory.rows if row.lost]
+        looked_up = set(lost) & asked.keys()
+        assert len(looked_up) >= 2 and asked.keys() > looked_up
+        assert set(asked.values()) == {1}
 
     def test_without_loop_closure_nobody_looks_for_it(self, rasterizer: Rasterizer) -> None:
         frames, _ = carried(BACK[:8])

@@ -9,7 +9,7 @@ from tcgsplat.geometry import se3
 from tcgsplat.loop.descriptor import open_descriptor
 from tcgsplat.loop.features import Features, features
 from tcgsplat.loop.localizer import Localizer
-from tcgsplat.loop.places import Place, Places, measured
+from tcgsplat.loop.places import Place, Places, View, measured
 from tcgsplat.loop.settings import LoopConfig
 from tcgsplat.render.protocol import Rasterizer
 from tcgsplat.scene.frame import Frame
@@ -50,8 +50,8 @@ class Relocalizer:
         self.places = Places(open_descriptor(config.descriptor, seed=seed), rasterizer)
         self.localizer = Localizer(config, tracker, confidence, rasterizer)
         self._load = load
-        self._rasterizer = rasterizer
         self._limit = config.candidates
+        self._features: dict[int, Features] = {}
 
     def remember(self, submap: Submap) -> None:
         """Know a finished submap's place from now on; in the order of the submaps."""
@@ -84,11 +84,22 @@ class Relocalizer:
 
     def _each(self, frame: Frame, seen: Features, active: Submap | None) -> Iterator[Relocalized | None]:
         if active is not None and active.keyframes:
-            place = Place.of(active, self._rasterizer)
+            place = self._growing(active)
             yield self._within(active, place.guess(seen, frame.camera, range(len(place.views))), frame)
         for index, views in self.places.similar(frame, seen, self._limit):
             guess = self.places[index].guess(seen, frame.camera, views)
             yield None if guess is None else self._within(measured(self._load(index)), guess, frame)
+
+    def _growing(self, active: Submap) -> Place:
+        """As far as a guess needs it: nothing is drawn, and a picture's features are looked for once while it grows."""
+        before, self._features = self._features, {}  # which keeps those of this submap only
+        views = []
+        for keyframe in active.keyframes:
+            frame = keyframe.frame
+            found = before[frame.index] if frame.index in before else features(frame)
+            self._features[frame.index] = found
+            views.append(View(keyframe.T_map_cam, frame.camera, found, confidence=0.0))
+        return Place(active.index, tuple(views))
 
     def _within(self, submap: Submap, guess: Pose | None, frame: Frame) -> Relocalized | None:
         if guess is None:
