@@ -19,6 +19,7 @@ from patterned_room import PatternedRoom
 from tcgsplat.config import SlamConfig
 from tcgsplat.geometry import se3
 from tcgsplat.loop import relocalization
+from tcgsplat.loop.closer import LoopCloser
 from tcgsplat.loop.features import Features, features
 from tcgsplat.loop.settings import LoopConfig
 from tcgsplat.mapping.schedule import ScheduleConfig
@@ -223,6 +224,17 @@ class TestLoop:
             assert (a.source, a.target, a.loop) == (b.source, b.target, b.loop)
             assert torch.equal(a.T_target_source, b.T_target_source)
             assert np.array_equal(a.information, b.information)
+
+    def test_a_submap_that_is_not_compared_is_remembered(self, closed: Run, rasterizer: Rasterizer) -> None:
+        """So does a live system that has fallen behind; later submaps are compared with it."""
+        load, last = closed.slam._store.load_submap, len(closed.slam.atlas) - 1
+        edges = {edge.source: edge for edge in closed.slam.closures[-1].edges if not edge.loop}
+        closer = LoopCloser(CONFIG.loop, CONFIG.tracker, CONFIG.confidence, rasterizer, load, CONFIG.seed)
+        for index in range(last):
+            assert not closer.closed(index, edges.get(index + 1), compare=False).registrations
+        found = closer.closed(last, None)
+        assert any(not pair.failed for pair in found.registrations)
+        assert all(not closure.edges for closure in closed.slam.closures[:-1]), "kept once is enough"
 
     def test_switched_off_nothing_is_compared(self, open_ended: Run) -> None:
         assert all(not c.registrations and not c.edges and not c.T_world_map for c in open_ended.slam.closures)

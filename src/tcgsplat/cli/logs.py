@@ -16,6 +16,13 @@ def say(sentence: str) -> None:
         sys.stderr.write(f"{sentence}\n")
 
 
+def sentence(error: Exception) -> str:
+    """What an error says; the system's own ones without their number."""
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
 class Capped(logging.Handler):
     """Writes records to standard error, of each kind (the same message but for its values) `SHOWN` at most."""
 

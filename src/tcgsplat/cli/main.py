@@ -89,7 +89,7 @@ def _run(command: str, arguments: list[str], debug: bool) -> int:
     except (TCGSplatError, OSError) as error:
         if debug:
             traceback.print_exc()
-        return _complain(_sentence(error), USAGE if isinstance(error, UsageError) else FAILED)
+        return _complain(logs.sentence(error), USAGE if isinstance(error, UsageError) else FAILED)
     except KeyboardInterrupt as interrupt:
         return _complain(str(interrupt) or "interrupted", INTERRUPTED)
 
@@ -117,13 +117,6 @@ def _split(arguments: list[str]) -> tuple[list[str], dict[str, str]]:
         else:
             own.append(argument)
     return own, flags
-
-
-def _sentence(error: Exception) -> str:
-    """Of the system's own errors, without their number."""
-    if isinstance(error, OSError) and error.strerror and error.filename:
-        return f"{error.filename}: {error.strerror}"
-    return str(error)
 
 
 def _complain(sentence: str, code: int) -> int:

@@ -16,7 +16,7 @@ import torch
 
 from tcgsplat.cli.interrupt import stopping_on_interrupt
 from tcgsplat.cli.kernels import compile_kernels
-from tcgsplat.cli.logs import say
+from tcgsplat.cli.logs import say, sentence
 from tcgsplat.cli.progress import RunProgress
 from tcgsplat.cli.summary import Summary, Tally
 from tcgsplat.config import SlamConfig, from_toml, settings, to_toml
@@ -185,8 +185,8 @@ def recorded(
     except OSError as error:  # a full disk, above all
         saved = f"{run.submap_count} submaps sealed before are saved"
         goes_on = "replace the run by --overwrite" if realtime else "go on by --resume"
-        what = f"{error.filename}: {error.strerror}"
-        raise ArchiveError(f"{what}; the run has stopped, {saved}: {run.path}; mend it and {goes_on}") from error
+        stopped = f"{sentence(error)}; the run has stopped, {saved}: {run.path}"
+        raise ArchiveError(f"{stopped}; mend it and {goes_on}") from error
     if not summary.interrupted:
         summary = replace(summary, frames_unreadable=len(sequence) - summary.frames - summary.frames_dropped)
     summary = replace(
