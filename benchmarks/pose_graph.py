@@ -59,11 +59,8 @@ def main(submaps: int) -> None:
             print(f"{i + 1:>5} {closed:>6} {seconds:>8.3f} s {len(closer.rejected):>5}", flush=True)
     rejected = {(edge.source, edge.target) for edge in closer.rejected}
     off = max(float((se3.inverse(T) @ U)[:3, 3].norm()) for T, U in zip(truth, closer.T_world_map, strict=True))
-    print(
-        f"{len(rejected & false)} of {len(false)} false edges rejected, and {len(rejected - false)} right ones;",
-        end=" ",
-    )
-    print(f"{100 * off:.1f} cm off at most")
+    told = f"{len(rejected & false)} of {len(false)} false edges rejected, and {len(rejected - false)} right ones"
+    print(f"{told}; {100 * off:.1f} cm off at most")
 
 
 def unread(index: int) -> Submap:

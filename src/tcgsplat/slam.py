@@ -51,7 +51,6 @@ with those before it; an error of theirs that is always the same adds up to a hu
 KNOWN = 0.5
 """Share of what a live camera measures that is in the map, below which the map is grown as soon as may be: where half
 is new, the rest is soon out of the picture."""
-
 BEHIND = 3
 """Finished submaps that a live system keeps waiting; with more, it remembers the next one and compares it with none:
 each holds its pictures while it waits, and a lost camera waits for all of them."""

@@ -33,12 +33,12 @@ class Capped(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the record as one line, unless enough like it have been seen."""
-        kind = str(record.msg)
+        kind, message = str(record.msg), record.getMessage()
         self._seen[kind] += 1
-        self._last[kind] = record.getMessage()
+        self._last[kind] = message
         if self._seen[kind] <= SHOWN or record.levelno < logging.WARNING:
             label = "warning: " if record.levelno >= logging.WARNING else ""
-            sys.stderr.write(f"tcgsplat: {label}{record.getMessage()}\n")
+            sys.stderr.write(f"tcgsplat: {label}{message}\n")
 
     def summarize(self) -> None:
         """Say how many records of each kind were not shown, and the last of them."""

@@ -180,12 +180,10 @@ def recorded(
             summary = record(slam, arrivals, run, progress.observe, stop.is_set, watch)
     except KeyboardInterrupt as interrupt:
         slam.abandon()
-        saved = f"{run.submap_count} submaps sealed before are saved"
-        raise KeyboardInterrupt(f"stopped at once; {saved}: {run.path}") from interrupt
+        raise KeyboardInterrupt(f"stopped at once; {_saved(run)}") from interrupt
     except OSError as error:  # a full disk, above all
-        saved = f"{run.submap_count} submaps sealed before are saved"
         goes_on = "replace the run by --overwrite" if realtime else "go on by --resume"
-        stopped = f"{sentence(error)}; the run has stopped, {saved}: {run.path}"
+        stopped = f"{sentence(error)}; the run has stopped, {_saved(run)}"
         raise ArchiveError(f"{stopped}; mend it and {goes_on}") from error
     if not summary.interrupted:
         summary = replace(summary, frames_unreadable=len(sequence) - summary.frames - summary.frames_dropped)
@@ -209,6 +207,10 @@ def recorded(
             "--overwrite and --max-gpu-memory GB, fewer than it has free, or with smaller pictures"
         )
     return summary
+
+
+def _saved(run: RunDirectory) -> str:
+    return f"{run.submap_count} submaps sealed before are saved: {run.path}"
 
 
 def record(

@@ -195,10 +195,11 @@ def _quality(
     map_view = SubmapView(whole.submap, drawing.rasterizer)
     trajectory, atlas = run.trajectory()
     velocities, delay = velocities_by_frame(trajectory, atlas), learnt_delay(run)
-    mapped = [row for row in trajectory.rows if row.mapped and row.submap_index < run.submap_count]
+    count = run.submap_count
+    mapped = [row for row in trajectory.rows if row.mapped and row.submap_index < count]
     middle_of_map = _middle(whole.exposed(row.submap_index, row.exposure) for row in mapped)
     gaussians = seen = 0
-    for index in range(run.submap_count):
+    for index in range(count):
         submap = run.load_submap(index)
         rows = [row for row in drawing.withheld if row.submap_index == index]
         unseen = withheld_views(rows, velocities, sequence, delay) if sequence is not None else iter(())

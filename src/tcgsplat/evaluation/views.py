@@ -96,12 +96,12 @@ def withheld_rows(run: RunDirectory, trajectory: Trajectory) -> tuple[TrackedPos
     Raises:
         ArchiveError: if a file of the run is damaged.
     """
-    mapped = {row.frame_index for row in trajectory.rows if row.mapped}
+    mapped, count = {row.frame_index for row in trajectory.rows if row.mapped}, run.submap_count
     if not mapped:
-        for index in range(run.submap_count):
+        for index in range(count):
             mapped |= {keyframe.frame.index for keyframe in run.load_submap(index).keyframes}
     every = withholding(run) or 1
-    saved = [row for row in trajectory.rows if row.submap_index < run.submap_count and row.frame_index % every == 0]
+    saved = [row for row in trajectory.rows if row.submap_index < count and row.frame_index % every == 0]
     return tuple(row for row in saved if not row.lost and row.frame_index not in mapped)
 
 

@@ -219,9 +219,8 @@ class RunDirectory:
         path = self.path / "trajectory.npz"
         if not path.exists():
             return Atlas()
-        return Atlas(
-            tuple(map(torch.from_numpy, archive.read_arrays(path, "trajectory", ("T_world_map",))["T_world_map"]))
-        )
+        poses = archive.read_arrays(path, "trajectory", ("T_world_map",))["T_world_map"]
+        return Atlas(tuple(torch.from_numpy(T) for T in poses))
 
     def write_summary(self, summary: Mapping[str, object]) -> None:
         """Say how the run went, once it has ended.
