@@ -9,6 +9,7 @@ import difflib
 import inspect
 import json
 import math
+import sys
 import textwrap
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -123,10 +124,16 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
 
 
 @cache
+def _classes(module: str) -> dict[str, ast.ClassDef]:
+    """Sources of a module's classes, by name: `inspect.getsource` of each would read the module several times over."""
+    source = inspect.getsource(sys.modules[module])
+    return {node.name: node for node in ast.parse(source).body if isinstance(node, ast.ClassDef)}
+
+
+@cache
 def _field_docs(owner: type) -> dict[str, str]:
     """Docstrings that follow the fields of a dataclass, by field."""
-    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(owner))).body
-    assert isinstance(definition, ast.ClassDef)
+    definition = _classes(owner.__module__)[owner.__name__]
     docs = {}
     for statement, following in zip(definition.body, definition.body[1:], strict=False):
         if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):

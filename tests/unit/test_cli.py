@@ -64,33 +64,6 @@ def test_a_run_begins_without_what_only_closing_a_loop_needs():
     assert done.returncode == 0, done.stderr
 
 
-def test_kernels_are_looked_for_without_linear_algebra_that_can_be_had_all_the_same():
-    """Importing it takes a tenth of a second, and only products of matrices need it."""
-    done = python(
-        "import sys; from tcgsplat.cli.ahead import compiled_meanwhile\n"
-        "with compiled_meanwhile():\n"
-        "    early = 'scipy.linalg' in sys.modules\n"
-        "import scipy.linalg.cython_blas\n"
-        "sys.exit(early)"
-    )
-    assert done.returncode == 0, done.stderr
-
-
-def test_imports_are_kept_from_the_collector_of_garbage_and_what_comes_later_is_not():
-    done = python(
-        "import gc; from tcgsplat.cli.ahead import compiled_meanwhile\n"
-        "with compiled_meanwhile():\n"
-        "    import torch\n"
-        "    assert not gc.isenabled()\n"
-        "frozen = gc.get_freeze_count()\n"
-        "assert gc.isenabled() and frozen > 100_000, frozen\n"
-        "with compiled_meanwhile():\n"
-        "    assert gc.isenabled()\n"
-        "assert gc.get_freeze_count() <= frozen\n"
-    )
-    assert done.returncode == 0, done.stderr
-
-
 def test_help_lists_every_command_and_every_command_is_there(capsys: pytest.CaptureFixture[str]):
     assert main(["--help"]) == 0
     text = capsys.readouterr().out

@@ -1,16 +1,20 @@
 """Compiling kernels while torch is imported: this module imports none of it."""
 
-import gc
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Final
 
+from tcgsplat.cli.imports import as_if_missing, here_to_stay, import_torch, load_meanwhile
 from tcgsplat.cli.logs import say
-from tcgsplat.render.numba_cpu.compilation import compiled, kernels_of
 from tcgsplat.render.numba_cpu.workers import available_cores
+
+UNNEEDED: Final = ("scipy", "scipy.linalg.cython_blas", "yaml")
+"""What numba imports where it finds it, 0.1 s: for products of matrices, and for a file of settings."""
+with as_if_missing(*UNNEEDED):
+    from tcgsplat.render.numba_cpu.compilation import compiled, kernels_of
 
 MODULES: Final = (
     "tcgsplat.render.numba_cpu.pass_kernels",
@@ -22,6 +26,8 @@ MODULES: Final = (
     "tcgsplat.tracking.smoothing_kernels",
 )
 """What a run on the CPU draws on; what takes long to compile first, so that processes finish together."""
+PURE: Final = ("rich.progress", "torchgen.model")
+"""Of what is imported sooner or later, big modules that hold no library: nothing waits for them while those load."""
 ANNOUNCEMENT: Final = "compiling kernels, once per machine: some seconds"
 
 
@@ -38,41 +44,16 @@ def compiled_meanwhile() -> Iterator[Waited]:
 
     Gives how long it took beyond that, once it is over.
     """
-    with _as_if_missing("scipy.linalg.cython_blas"):  # which numba takes 0.1 s to import, for products of matrices
-        waited, kernels = Waited(), [kernel for kernel in kernels_of(MODULES) if not kernel.kept]
+    with as_if_missing(*UNNEEDED):
+        all_kernels = kernels_of(MODULES)
+        load_meanwhile()
+        waited, kernels = Waited(), [kernel for kernel in all_kernels if not kernel.kept]
     if kernels:
         say(ANNOUNCEMENT)
-    with compiled(kernels, available_cores()), _here_to_stay():
+    with compiled(kernels, available_cores()), here_to_stay():
+        for module in PURE:
+            import_module(module)
+        import_torch()
         yield waited
         inside = time.perf_counter()
     waited.seconds = time.perf_counter() - inside
-
-
-@contextmanager
-def _as_if_missing(module: str) -> Iterator[None]:
-    """Whoever imports it inside finds that it is not installed, unless it is there already."""
-    absent = module not in sys.modules
-    if absent:
-        sys.modules[module] = None  # type: ignore[assignment]  # what Python itself puts there to say so
-    try:
-        yield
-    finally:
-        if absent:
-            del sys.modules[module]
-
-
-@contextmanager
-def _here_to_stay() -> Iterator[None]:
-    """Python looks for no garbage inside, nor ever again among what was made there: imports make 340 000 objects.
-
-    Only where they are made indeed: if torch was imported before, what is around may be garbage some day.
-    """
-    if "torch" in sys.modules:
-        yield
-        return
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.freeze()
-        gc.enable()
