@@ -100,8 +100,8 @@ def _frames_without_modules() -> Iterator[None]:
     """
     getmodule = inspect.getmodule
 
-    def unless_frame(of: object, file: str | None = None) -> ModuleType | None:
-        return None if inspect.isframe(of) else getmodule(of, file)
+    def unless_frame(object: object, _filename: str | None = None) -> ModuleType | None:  # noqa: A002  # its own name
+        return None if inspect.isframe(object) else getmodule(object, _filename)
 
     inspect.getmodule = unless_frame
     try:
