@@ -182,7 +182,8 @@ class TestHandedOn:
     ) -> None:
         """The submap itself shows nothing yet; the one before knows what is behind him."""
         begins = next(report.frame_index for report in walked.reports if report.sealed)
-        slam = Slam(with_settings(CONFIG, {"confidence.model": model}), rasterizer)
+        then = {"schedule.submap_by": "interval", "schedule.submap_interval": begins}  # not by how far, to a hair
+        slam = Slam(with_settings(CONFIG, {"confidence.model": model, **then}), rasterizer)
         for frame in SEQUENCE:
             depth = frame.depth.clone()
             if frame.index == begins:
