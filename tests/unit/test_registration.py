@@ -16,7 +16,7 @@ from tcgsplat.loop.descriptor import Vectors, Vlad
 from tcgsplat.loop.localizer import Localizer
 from tcgsplat.loop.places import Place
 from tcgsplat.loop.registration import (
-    FLOOR,
+    COMMON,
     Estimate,
     Registration,
     Side,
@@ -309,7 +309,7 @@ class TestFusion:
         ones = [Estimate(i, "", se3.exp(x), MILLIMETRE * (i + 1), 0.1 * i) for i, x in enumerate(tangents(2e-3))]
         torch.testing.assert_close(_fused(ones)[0], _fused(ones[::-1])[0], atol=1e-9, rtol=0)
 
-    def test_knows_more_than_each_until_the_floor(self) -> None:
+    def test_knows_more_than_each_until_what_all_have_in_common(self) -> None:
         generator = np.random.default_rng(3)
         root = 30 * generator.standard_normal((6, 6))
         one = Estimate(0, "", se3.identity(), root.T @ root)
@@ -317,8 +317,8 @@ class TestFusion:
         informations.append(_fused([replace(one, information=1e9 * one.information)] * 2)[1])
         for less, more in pairwise(informations):
             assert np.linalg.eigvalsh(more - less)[0] > 0
-        np.testing.assert_allclose(informations[0], np.linalg.inv(covariance(one.information)), rtol=1e-6)
-        ceiling = np.linalg.inv(FLOOR)
+        np.testing.assert_allclose(informations[0], np.linalg.inv(covariance(one.information, COMMON)), rtol=1e-6)
+        ceiling = np.linalg.inv(COMMON)
         for information in informations:
             assert np.linalg.eigvalsh(ceiling - information)[0] > -1e-6 * ceiling.max()
         np.testing.assert_allclose(informations[-1], ceiling, rtol=0.01, atol=0.01 * ceiling.max())
@@ -332,5 +332,5 @@ class TestFusion:
         assert np.abs(pair.information - pair.information.T).max() <= 1e-9 * np.abs(pair.information).max()
         assert np.linalg.eigvalsh(pair.information)[0] > 0
         for one in pair.estimates:
-            sure = np.linalg.inv(covariance(one.information))
+            sure = np.linalg.inv(covariance(one.information, COMMON))
             assert np.linalg.eigvalsh(pair.information - sure)[0] > -1e-6 * sure.max()
