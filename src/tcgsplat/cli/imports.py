@@ -60,10 +60,14 @@ def load_meanwhile() -> None:
     cannot be loaded, and a torch for GPUs, which looks for its libraries in more places.
     """
     libraries = [*_files_of("cv2", "cv2*.so")]
-    if not _files_of("torch", "lib/libtorch_cuda.*"):
+    if not _torch_is_for_gpus():
         libraries = [*_files_of("torch", "lib/libtorch_cpu.*"), *libraries]
     if libraries and os.name == "posix":
         Thread(target=_load, args=(libraries,), daemon=True).start()
+
+
+def _torch_is_for_gpus() -> bool:
+    return any(_files_of("torch", f"lib/libtorch_{kind}.*") for kind in ("cuda", "hip", "xpu"))
 
 
 def _files_of(package: str, pattern: str) -> list[Path]:
@@ -83,9 +87,10 @@ def import_torch() -> None:
     """Import torch but for a fifth of it that no run needs: what shapes come out of tensors without data.
 
     Its compilers ask for that. Whoever does, or imports one more of torch's modules, gets it first. Until then
-    `torch.Generator()` raises RuntimeError; `torch.default_generator.clone_state()` gives one all the same.
+    `torch.Generator()` raises RuntimeError; `torch.default_generator.clone_state()` gives one all the same. A torch for
+    GPUs, with which nobody has tried this, is imported whole, and so is another version.
     """
-    if "torch" not in sys.modules and _torch_version().startswith(_KNOWN):
+    if "torch" not in sys.modules and _torch_version().startswith(_KNOWN) and not _torch_is_for_gpus():
         sys.modules[_SHAPES] = _Postponed(_SHAPES)
         with _frames_without_modules():
             import_module("torch")
