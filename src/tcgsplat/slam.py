@@ -138,9 +138,8 @@ class Slam:
         self._rasterizer, self._device, self._core = rasterizer, rasterizer.device, rasterizer.reserved
         self._store = InMemory() if store is None else store
         self._ids = IdSource()
-        self._generator = torch.default_generator.clone_state().manual_seed(
-            config.seed
-        )  # see `cli.imports.import_torch`
+        # Not `torch.Generator()`, which is not to be had in a process that `cli.imports` has made start at once.
+        self._generator = torch.default_generator.clone_state().manual_seed(config.seed)
         self._tracker = Tracker(config.tracker, config.confidence, rasterizer)
         self._mapper = mapper(config.mapper, config.confidence, rasterizer, self._ids, self._generator)
         self._schedule = Schedule(config.schedule)

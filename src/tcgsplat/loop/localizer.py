@@ -19,8 +19,8 @@ from tcgsplat.tracking.tracker import Tracked, Tracker
 
 ALIKE = 64
 """Residuals that count as one measurement: those of neighbouring pixels are alike. With it, the errors of registered
-views on a synthetic apartment with a Kinect's noise are as large as their covariance says (chi2 a degree of freedom 1.6
-at the median without the floor of an edge, 0.3 with it)."""
+views on a synthetic apartment with a Kinect's noise were as large as their covariance says (chi2 a degree of freedom
+1.6 at the median, without any floor)."""
 _SETTLED_METERS, _SETTLED_RADIANS = 0.005, 0.005
 """A second alignment, begun where the first ended, may move the pose by no more: else it has not arrived."""
 

@@ -27,8 +27,9 @@ errors of their own, with which pictures agree perfectly. Measured: the best rig
 1.5 mm a frame."""
 COMMON = np.diag([0.006**2] * 3 + [0.004**2] * 3)
 """The same of what views agree upon: they share the bend of both submaps. Measured: registered submaps of 20 cm of
-fr1/xyz are off by 5.5 mm and 5.8 mrad an axis (motion capture's errors in it), of a synthetic walk with a Kinect's
-noise by 2.3 mm and 0.7 mrad; in both, edges of the odometry are off by no more, and must not be overruled."""
+fr1/xyz are off by 5.5 mm and 5.8 mrad an axis (motion capture's errors in it), where edges of the odometry are off by
+6.1 and 6.5; of a synthetic walk with a Kinect's noise by 2.3 mm and 0.7 mrad, and those by 1.0 and 0.5. So these must
+not be overruled."""
 _CHI2 = 22.46
 """Squared Mahalanobis distance that two estimates of one pose exceed once in a thousand, six degrees of freedom."""
 _APART_METERS, _APART_RADIANS = 0.05, 0.035
